@@ -1,0 +1,34 @@
+# Everything a fresh machine with Python >= 3.11 needs: `make demo`, `make test`.
+
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+# Written when the environment is complete, and older than what it was made from when it is not.
+READY := $(VENV)/.ready
+OUT ?= out/paper
+
+.PHONY: demo test check format clean
+
+demo: $(READY)  ## The paper, from five sets of failed demonstrations; ends with the report's path.
+	$(BIN)/misstep reproduce --quick --out $(OUT)
+
+test: $(READY) check  ## Every check and every test.
+	$(BIN)/pytest -n 2
+
+check: $(READY)  ## Lint, format, types.
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(READY)  ## Mend what can be mended by a machine.
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "misstep needs Python 3.11 or newer; set PYTHON=/path/to/it")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $(READY)
+
+clean:  ## Remove the environment and all outputs.
+	rm -rf $(VENV) out .mypy_cache .pytest_cache .ruff_cache .hypothesis

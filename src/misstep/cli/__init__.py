@@ -1,0 +1,20 @@
+"""The command line, ``misstep``: one file a group of commands.
+
+    app.py            the commands put together, and what becomes of errors
+    options.py        options that several commands share, and how their texts are read
+    output.py         tables and JSON files
+    progress.py       a progress bar on a terminal, lines elsewhere
+    interruption.py   what to do after a Ctrl-C
+    record.py         demonstrate
+    learn.py          learn, resume
+    evaluate.py       evaluate
+    reproduce.py      reproduce
+    catalogue.py      list
+
+A command imports what it needs when it runs: ``misstep --help`` must not wait for the physics and
+the compiled loops. It returns its exit code.
+"""
+
+from misstep.cli.app import main
+
+__all__ = ["main"]

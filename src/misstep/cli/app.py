@@ -1,0 +1,130 @@
+"""All commands under one name, and what becomes of errors.
+
+==== ==============================================================================
+code meaning
+==== ==============================================================================
+0    the command did what it claims
+1    it ran, and did not: no trial succeeded; or nobody read its output to the end
+2    bad input: one line on stderr says what, where, and what would be right
+130  interrupted with Ctrl-C
+==== ==============================================================================
+"""
+
+import io
+import os
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from misstep.cli import catalogue, evaluate, learn, record, reproduce
+from misstep.errors import MisstepError
+from misstep.version import __version__
+
+
+class _Commands(TyperGroup):
+    """A group of commands that names them all when asked for one that it does not have."""
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        command = super().get_command(ctx, cmd_name)
+        if command is None:
+            raise MisstepError(
+                f"no command named {cmd_name!r}; there are: {', '.join(self.list_commands(ctx))}"
+            )
+        return command
+
+
+# The backspace keeps the help from breaking the line.
+_EXAMPLE = "\b\nExample:\n  {}"
+
+# Plain help instead of boxes: it is there at once, and an example in it can be copied.
+app = typer.Typer(cls=_Commands, add_completion=False, rich_markup_mode=None)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"misstep {__version__}")
+        raise typer.Exit
+
+
+@app.callback(epilog=_EXAMPLE.format("misstep demonstrate cartpole --by weak -n 4 --out D.h5"))
+def misstep(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
+    ] = False,
+) -> None:
+    """Learn a working controller from demonstrations that all failed."""
+
+
+for _module in (record, learn, evaluate, reproduce, catalogue):
+    for _name, _command, _example in _module.COMMANDS:
+        app.command(_name, epilog=_EXAMPLE.format(_example))(_command)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Words after ``misstep``; those that the process was started with if left out.
+
+    Returns
+    -------
+    int
+        The exit code.
+    """
+    _replace_unprintable()
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    command = typer.main.get_command(app)
+    try:
+        # Not `app(...)`, which has its own ideas of interrupts, closed pipes and tracebacks.
+        with command.make_context("misstep", words) as context:
+            code = command.invoke(context)
+        sys.stdout.flush()
+    except typer.Exit as exit_:
+        return exit_.exit_code
+    except typer.TyperException as error:
+        return _tell(f"error: {_usage(error)}", 2)
+    except MisstepError as error:
+        return _tell(f"error: {error}", 2)
+    except KeyboardInterrupt as interrupt:
+        return _tell("; ".join(["interrupted", *map(str, interrupt.args)]), 130)
+    except BrokenPipeError:
+        # Python flushes stdout once more at its end, and would complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    return int(code or 0)
+
+
+def _tell(message: str, code: int) -> int:
+    print("misstep:", " ".join(message.split()), file=sys.stderr)
+    return code
+
+
+def _usage(error: typer.TyperException) -> str:
+    """Say what is wrong with the words of the command line, and what would be right."""
+    context = getattr(error, "ctx", None)
+    if context is not None and hasattr(error, "possibilities"):  # an unknown option
+        options = [o for p in context.command.get_params(context) for o in p.opts if o[0] == "-"]
+        return (
+            f"`{context.command_path}` has no option {error.option_name}; "  # type: ignore[attr-defined]
+            f"there are: {', '.join(options)}"
+        )
+    message = error.format_message().rstrip(".")
+    message = message[:1].lower() + message[1:]
+    if context is None:
+        return message
+    return f"{message}; see `{context.command_path} --help`"
+
+
+def _replace_unprintable() -> None:
+    """Print ``?`` on a terminal that cannot show a letter, rather than fail."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")

@@ -1,0 +1,82 @@
+"""``misstep list``: what there is, with every parameter, its default, unit and meaning."""
+
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import typer
+
+from misstep.cli.options import JsonFile
+from misstep.cli.output import check_output_file, print_table, write_result
+from misstep.errors import MisstepError
+from misstep.parameters import ParameterRow, parameter_table
+
+
+def list_(
+    what: Annotated[
+        str, typer.Argument(metavar="WHAT", help="systems, learners, demonstrators or formats.")
+    ],
+    json: JsonFile = None,
+) -> int:
+    """List what there is, with its parameters."""
+    if what not in _CATALOGUES:
+        raise MisstepError(f"nothing to list named {what!r}; there are: {', '.join(_CATALOGUES)}")
+    check_output_file(json, "--json")
+    entries = _CATALOGUES[what]()
+    write_result(json, {"parameters": {"what": what}, what: entries})
+    for name, entry in entries.items():
+        print(_heading(name, entry))
+        if entry.get("parameters"):
+            rows = [ParameterRow(**row) for row in entry["parameters"]]
+            cells = [(r.name, _default(r), r.unit, r.meaning) for r in rows]
+            print_table(("parameter", ">default", "unit", "meaning"), cells)
+    return 0
+
+
+def _systems() -> dict[str, dict[str, Any]]:
+    from misstep import SYSTEMS
+
+    return {name: _describe(kind, kind.parameters_type) for name, kind in SYSTEMS.items()}
+
+
+def _learners() -> dict[str, dict[str, Any]]:
+    from misstep import LEARNERS
+
+    return {name: {"rung": kind.rung, **_describe(kind, kind)} for name, kind in LEARNERS.items()}
+
+
+def _demonstrators() -> dict[str, dict[str, Any]]:
+    from misstep import DEMONSTRATORS
+
+    return {name: _describe(kind, kind) for name, kind in DEMONSTRATORS.items()}
+
+
+def _formats() -> dict[str, dict[str, Any]]:
+    from misstep import FORMATS
+
+    return {name: {"suffixes": list(entry.suffixes)} for name, entry in FORMATS.items()}
+
+
+_CATALOGUES: dict[str, Callable[[], dict[str, dict[str, Any]]]] = {
+    "systems": _systems,
+    "learners": _learners,
+    "demonstrators": _demonstrators,
+    "formats": _formats,
+}
+
+
+def _describe(kind: type, parameters: type) -> dict[str, Any]:
+    summary = (kind.__doc__ or "").strip().partition("\n")[0]
+    return {"summary": summary, "parameters": [r._asdict() for r in parameter_table(parameters)]}
+
+
+def _heading(name: str, entry: dict[str, Any]) -> str:
+    if "suffixes" in entry:
+        return f"{name}: {', '.join(entry['suffixes'])}"
+    return f"{name}: {entry['summary']}"
+
+
+def _default(row: ParameterRow) -> str:
+    return str(row.default).lower() if isinstance(row.default, bool) else str(row.default)
+
+
+COMMANDS = [("list", list_, "misstep list learners")]

@@ -1,0 +1,77 @@
+"""What a command leaves behind: tables on stdout, and a JSON file."""
+
+import sys
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from misstep.errors import MisstepError
+from misstep.storage import write_json
+from misstep.trajectory import Trajectory
+from misstep.version import __version__, command_line
+
+_WIDTH_OF_A_FILE = 240
+
+
+def check_output_file(path: Path | None, option: str) -> None:
+    """Make sure that a file can be written, before hours of work are spent on what goes in.
+
+    Raises
+    ------
+    MisstepError
+        If it is a folder, or no file can be made where it should go.
+    """
+    if path is None:
+        return
+    if path.is_dir():
+        raise MisstepError(f"{option} {path} is a folder: name a file")
+    try:
+        tempfile.TemporaryFile(dir=path.parent).close()
+    except OSError as error:
+        raise MisstepError(
+            f"{option} {path}: cannot write to the folder {path.parent}: {error.strerror}; "
+            "choose one that exists and can be written to"
+        ) from error
+
+
+def write_result(path: Path | None, result: Mapping[str, object]) -> None:
+    """Write a command's result as JSON, with the version and the command that it came from."""
+    if path is not None:
+        origin = {"version": __version__, "command": list(command_line())}
+        write_json(path, {**origin, **result})
+
+
+def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table; columns whose name starts with ``>`` are set to the right."""
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=SIMPLE, pad_edge=False)
+    for column in columns:
+        right = column.startswith(">")
+        table.add_column(column.lstrip(">"), justify="right" if right else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    width = None if sys.stdout.isatty() else _WIDTH_OF_A_FILE
+    Console(markup=False, emoji=False, highlight=False, width=width).print(table)
+
+
+def print_attempts(name: str, attempts: Sequence[Trajectory]) -> None:
+    """Print one line an attempt: how long it took, what became of it, when it failed, its cost."""
+    columns = (name, ">duration [s]", "outcome", ">failed at [s]", ">mean cost")
+    rows = [
+        (
+            str(number),
+            f"{attempt.duration:.2f}",
+            str(attempt.outcome),
+            _number(attempt.failure_time, ".2f"),
+            _number(attempt.mean_cost, ".4g"),
+        )
+        for number, attempt in enumerate(attempts, start=1)
+    ]
+    print_table(columns, rows)
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)

@@ -1,0 +1,81 @@
+"""``misstep demonstrate``: record demonstrations that fail."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from misstep.cli.options import JsonFile, Seed, SystemName, parse_parameters
+from misstep.cli.output import (
+    check_output_file,
+    print_attempts,
+    write_result,
+)
+from misstep.cli.progress import progress
+from misstep.errors import MisstepError
+from misstep.parameters import build_parameters
+
+
+def demonstrate(
+    system: SystemName,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Where the demonstrations go.")],
+    by: Annotated[
+        str, typer.Option(metavar="KIND", help="A kind of `misstep list demonstrators`.")
+    ] = "noisy",
+    n: Annotated[int, typer.Option("-n", help="How many failed attempts to record.")] = 4,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="A parameter of the system; repeatable."),
+    ] = None,
+    with_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--with", metavar="NAME=VALUE", help="A parameter of the demonstrator; repeatable."
+        ),
+    ] = None,
+    seed: Seed = 0,
+    force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
+    json: JsonFile = None,
+) -> int:
+    """Record failed demonstrations of a system."""
+    import misstep
+
+    given: dict[str, Any] = parse_parameters("--with", with_)
+    kind = build_parameters(misstep.DEMONSTRATORS[by], f"demonstrator {by}", given)
+    driven = misstep.make_system(system, **parse_parameters("--set", set_))
+    _check_out(out, force)
+    check_output_file(json, "--json")
+    with progress("demonstrating"):
+        dataset = misstep.demonstrate(driven, by, n, seed, **given)
+    misstep.save_dataset(dataset, out)
+    demonstrator = asdict(kind)  # type: ignore[call-overload]
+    result = {
+        "parameters": {"system": driven.parameters, "demonstrator": demonstrator},
+        "system": system,
+        "demonstrator": by,
+        "seed": seed,
+        "out": str(out),
+        "episodes": len(dataset),
+        "outcomes": [str(attempt.outcome) for attempt in dataset],
+        "failure_times": [attempt.failure_time for attempt in dataset],
+        "costs": [attempt.mean_cost for attempt in dataset],
+    }
+    write_result(json, result)
+    print_attempts("episode", dataset)
+    print(f"{len(dataset)} failed demonstrations in {out}")
+    return 0
+
+
+def _check_out(out: Path, force: bool) -> None:
+    from misstep.formats import format_of
+
+    format_of(out)
+    check_output_file(out, "--out")
+    if out.exists() and not force:
+        raise MisstepError(f"--out {out} exists already: choose another name, or add --force")
+
+
+COMMANDS = [
+    ("demonstrate", demonstrate, "misstep demonstrate cartpole --by weak -n 4 --out D.h5"),
+]

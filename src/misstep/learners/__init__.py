@@ -1,0 +1,21 @@
+"""Strategies that turn failed attempts into the next policy: one strategy a file, one registry."""
+
+from misstep.learners.donut import DonutLearner, DonutPolicy
+from misstep.learners.donut_cost import DonutCostLearner
+from misstep.learners.learner import LEARNERS, Evidence, LearnedPolicy, Learner, Task
+from misstep.learners.mean import Mean, MeanPolicy
+from misstep.learners.mixtures import MixturePolicy
+
+__all__ = [
+    "LEARNERS",
+    "DonutCostLearner",
+    "DonutLearner",
+    "DonutPolicy",
+    "Evidence",
+    "LearnedPolicy",
+    "Learner",
+    "Mean",
+    "MeanPolicy",
+    "MixturePolicy",
+    "Task",
+]

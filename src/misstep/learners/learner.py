@@ -1,0 +1,137 @@
+"""What a learner is: a strategy that turns what was tried into the next policy.
+
+A learner keeps nothing between trials. It is handed all the evidence again each time and draws
+from the generator of that trial alone, so that a run that was interrupted goes on exactly as one
+that was not.
+
+Each learner states its rung on the ladder of feedback, and the evidence holds no more than that
+rung may see:
+
+==== ===================================================================
+rung what the learner is told of an attempt
+==== ===================================================================
+0    observations and actions
+1    … and whether it succeeded
+2    … and when it failed
+3    … and what each step cost
+4    … and it may learn how the system responds
+==== ===================================================================
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from misstep.errors import MisstepError
+from misstep.registry import Registry
+from misstep.rollout import Policy
+from misstep.systems.system import System
+from misstep.trajectory import Column, Dataset, Outcome, Trajectory
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a learner knows of the system before anybody has tried anything."""
+
+    observation_columns: tuple[Column, ...]
+    action_columns: tuple[Column, ...]
+    action_low: Array
+    """Smallest action, shape (m,)."""
+    action_high: Array
+    """Largest action, shape (m,)."""
+    state: tuple[str, ...]
+    """Names of the observation columns that the policy may depend on."""
+
+    @classmethod
+    def of(cls, system: System, state: Sequence[str] | None = None) -> Self:
+        """Return the task of driving `system`, seen through the columns `state` (None: all).
+
+        Raises
+        ------
+        MisstepError
+            If `state` is empty, repeats a column or names one that the system does not observe.
+        """
+        names = [column.name for column in system.observation_columns]
+        chosen = tuple(names if state is None else state)
+        unknown = [name for name in chosen if name not in names]
+        if unknown or not chosen or len(set(chosen)) < len(chosen):
+            raise MisstepError(
+                f"state {','.join(chosen) or '(empty)'}: choose distinct columns among "
+                f"{', '.join(names)}"
+            )
+        space: Any = system.action_space
+        return cls(
+            system.observation_columns,
+            system.action_columns,
+            np.array(space.low, dtype=np.float64),
+            np.array(space.high, dtype=np.float64),
+            chosen,
+        )
+
+    @property
+    def state_indices(self) -> NDArray[np.intp]:
+        """Positions of the state's columns among the observations, shape (n,)."""
+        names = [column.name for column in self.observation_columns]
+        return np.array([names.index(name) for name in self.state], dtype=np.intp)
+
+    def joint(self, trajectory: Trajectory) -> Array:
+        """Return the (state, action) pairs of a trajectory, shape (T, n + m)."""
+        return np.concatenate([trajectory.select(self.state)[:-1], trajectory.actions], axis=1)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Everything that has been tried so far, as far as the learner's rung may see it."""
+
+    demonstrations: tuple[Trajectory, ...]
+    trials: tuple[Trajectory, ...]
+
+    @classmethod
+    def seen_from(cls, rung: int, demonstrations: Dataset, trials: Sequence[Trajectory]) -> Self:
+        """Return the evidence with everything above `rung` taken out."""
+        return cls(
+            tuple(_seen_from(rung, t) for t in demonstrations),
+            tuple(_seen_from(rung, t) for t in trials),
+        )
+
+    @property
+    def attempts(self) -> tuple[Trajectory, ...]:
+        """Demonstrations, then trials."""
+        return self.demonstrations + self.trials
+
+
+class LearnedPolicy(Policy, Protocol):
+    """A policy that can be kept in a file of plain arrays."""
+
+    def arrays(self) -> dict[str, Array]:
+        """Return all that `Learner.restore` needs to build the same policy again."""
+
+
+class Learner(Protocol):
+    """A strategy; by convention a frozen dataclass of parameters (`misstep.parameters`)."""
+
+    rung: ClassVar[int]
+
+    def policy(self, task: Task, evidence: Evidence, rng: np.random.Generator) -> LearnedPolicy:
+        """Return the policy to try next."""
+
+    @staticmethod
+    def restore(task: Task, arrays: Mapping[str, Array]) -> LearnedPolicy:
+        """Return the policy that `LearnedPolicy.arrays` described."""
+
+
+LEARNERS: Registry[type[Learner]] = Registry("learner", "misstep.learners")
+
+
+def _seen_from(rung: int, trajectory: Trajectory) -> Trajectory:
+    return replace(
+        trajectory,
+        outcome=trajectory.outcome if rung >= 1 else Outcome.UNKNOWN,
+        failure_step=trajectory.failure_step if rung >= 2 else None,
+        costs=trajectory.costs if rung >= 3 else None,
+    )

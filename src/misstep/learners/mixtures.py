@@ -1,0 +1,104 @@
+"""What the mixture learners share: fitting the (state, action) pairs, and keeping the result."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from misstep.errors import MisstepError
+from misstep.learners.learner import Task
+from misstep.mixture import Conditioner, GaussianMixture
+from misstep.parameters import parameter
+
+Array = NDArray[np.float64]
+
+# Half a percent of a column's spread: finer detail is noise, and forces clipped at the actuator's
+# limit would otherwise grow components without width.
+COVARIANCE_FLOOR = 2.5e-5
+
+
+@dataclass(frozen=True)
+class MixtureParameters:
+    """Parameters of every learner that fits a mixture."""
+
+    n_components: int = parameter(
+        0, "", "components of the mixture; 0: chosen by minimum BIC", at_least=0
+    )
+    max_components: int = parameter(6, "", "largest number that BIC may choose", at_least=1)
+
+    def fit(
+        self, samples: Array, rng: np.random.Generator, sample_weight: Array | None = None
+    ) -> GaussianMixture:
+        """Fit joint samples (N, n + m), optionally weighted (N,)."""
+        return GaussianMixture(
+            n_components=self.n_components or None,
+            max_components=self.max_components,
+            covariance_floor=COVARIANCE_FLOOR,
+            tol=1e-4,
+            random_state=rng,
+        ).fit(samples, sample_weight=sample_weight)
+
+
+def joint_samples(task: Task, attempts: Sequence[object]) -> Array:
+    """Return the (state, action) pairs of all attempts, shape (N, n + m).
+
+    Raises
+    ------
+    MisstepError
+        If a column never varies: then there is nothing to learn from it.
+    """
+    samples = np.concatenate([task.joint(t) for t in attempts])  # type: ignore[arg-type]
+    names = [*task.state, *(column.name for column in task.action_columns)]
+    for name, column in zip(names, samples.T, strict=True):
+        if np.all(column == column[0]):
+            raise MisstepError(
+                f"column {name} is constant ({column[0]:g}) in all attempts: leave it out of the "
+                f"state, or record attempts in which it varies"
+            )
+    return samples
+
+
+class MixturePolicy:
+    """A policy read off a mixture of (state, action) pairs at the present state.
+
+    Parameters
+    ----------
+    task : Task
+    mixture : GaussianMixture
+        Fitted on the columns (state, action) in that order.
+    """
+
+    def __init__(self, task: Task, mixture: GaussianMixture) -> None:
+        self.task = task
+        self.mixture = mixture
+        self.conditioner = Conditioner(mixture, range(len(task.state)))
+        self._indices = task.state_indices
+
+    def reset(self) -> None:
+        """Forget the attempt before."""
+
+    def arrays(self) -> dict[str, Array]:
+        """Return the mixture's parameters."""
+        return {
+            "weights": self.mixture.weights_,
+            "means": self.mixture.means_,
+            "covariances": self.mixture.covariances_,
+        }
+
+    def state_of(self, observation: Array) -> Array:
+        """Return the state's columns of an observation, shape (n,)."""
+        state: Array = observation[self._indices]
+        return state
+
+    def clipped(self, action: Array) -> Array:
+        """Return the action inside the actuator's limits."""
+        limited: Array = np.minimum(np.maximum(action, self.task.action_low), self.task.action_high)
+        return limited
+
+
+def restore_mixture(arrays: Mapping[str, Array]) -> GaussianMixture:
+    """Return the mixture that `MixturePolicy.arrays` described."""
+    return GaussianMixture.from_parameters(
+        arrays["weights"], arrays["means"], arrays["covariances"]
+    )

@@ -1,0 +1,116 @@
+"""Gaussian mixture regression: what a joint mixture says of the actions, given a state.
+
+For component k with state block x and action block a,
+
+    h_k(ξ) ∝ π_k N(ξ; μ_x, Σ_xx)
+    m_k(ξ) = μ_a + Σ_ax Σ_xx⁻¹ (ξ − μ_x)
+    S_k    = Σ_aa − Σ_ax Σ_xx⁻¹ Σ_xa
+
+The h_k are computed in logs, so they are finite and sum to 1 however far ξ is from the data.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from misstep.errors import MisstepError
+from misstep.mixture import compiled
+
+if TYPE_CHECKING:
+    from misstep.mixture.gaussian_mixture import GaussianMixture
+
+Array = NDArray[np.float64]
+
+
+class Conditional(NamedTuple):
+    """The mixture of actions at one state."""
+
+    weights: Array
+    """h_k, shape (K,), summing to 1."""
+    means: Array
+    """m_k, shape (K, d), in the action's unit."""
+    covariances: Array
+    """S_k, shape (K, d, d)."""
+
+    @property
+    def mean(self) -> Array:
+        """E = Σ h_k m_k, shape (d,)."""
+        return self.weights @ self.means
+
+    @property
+    def variance(self) -> Array:
+        """V = Σ h_k (S_k + m_k m_kᵀ) − E Eᵀ, shape (d, d), summed about E for accuracy."""
+        deviations = self.means - self.mean
+        outer = deviations[:, :, None] * deviations[:, None, :]
+        return np.einsum("k,kij->ij", self.weights, self.covariances + outer)
+
+
+class Conditioner:
+    """A joint mixture made ready to be conditioned on some of its columns, many times.
+
+    Parameters
+    ----------
+    mixture : GaussianMixture
+        Fitted, with d_joint columns.
+    given : sequence of int, length n
+        The columns that will be known (the state); the others are the d actions.
+
+    Raises
+    ------
+    MisstepError
+        If `given` is not some, and not all, of the columns.
+    """
+
+    def __init__(self, mixture: "GaussianMixture", given: Sequence[int]) -> None:
+        joint = mixture.means_.shape[1]
+        known = [int(i) for i in given]
+        others = [i for i in range(joint) if i not in known]
+        if not others or len(known) + len(others) != joint or not known:
+            raise MisstepError(
+                f"condition on some, not all, of the columns 0 to {joint - 1}, got {known}"
+            )
+        covariances = mixture.covariances_
+        K, n, d = len(covariances), len(known), len(others)
+        self.state_means = np.ascontiguousarray(mixture.means_[:, known])
+        self.action_means = np.ascontiguousarray(mixture.means_[:, others])
+        self.gains = np.empty((K, d, n))
+        self.covariances = np.empty((K, d, d))
+        self.state_whiteners = np.empty((K, n, n))
+        self.state_constants = np.empty(K)
+        state_covariances = np.ascontiguousarray(covariances[:, known][:, :, known])
+        compiled.precompute(
+            mixture.weights_, state_covariances, self.state_whiteners, self.state_constants
+        )
+        for k in range(K):
+            cross = covariances[k][np.ix_(known, others)]
+            self.gains[k] = cho_solve(cho_factor(state_covariances[k]), cross).T
+            remaining = covariances[k][np.ix_(others, others)] - self.gains[k] @ cross
+            self.covariances[k] = 0.5 * (remaining + remaining.T)
+
+    def at(self, state: ArrayLike) -> Conditional:
+        """Return the mixture of the other columns at `state` of shape (n,).
+
+        Raises
+        ------
+        MisstepError
+            If `state` has another shape or is not finite.
+        """
+        x = np.array(state, dtype=np.float64)
+        n = self.state_means.shape[1]
+        if x.shape != (n,) or not np.all(np.isfinite(x)):
+            raise MisstepError(f"a state here is {n} finite numbers, got {x.tolist()}")
+        h, m = np.empty(len(self.gains)), np.empty_like(self.action_means)
+        compiled.condition(
+            x,
+            self.state_constants,
+            self.state_means,
+            self.state_whiteners,
+            self.gains,
+            self.action_means,
+            h,
+            m,
+        )
+        return Conditional(h, m, self.covariances)

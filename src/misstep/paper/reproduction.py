@@ -1,0 +1,269 @@
+"""`misstep reproduce`: run every experiment of the paper, and write its figures, tables and report.
+
+    reproduce.json            version, command, seeds: all that rebuilds the rest
+    cells/VARIANT/000.json    the measures of one variant with one seed
+    runs/VARIANT/             the run of the first seed, whole: a run folder like any other
+    figures/  videos/         as in the paper, PNG and PDF, MP4
+    tables.json  report.html  the results
+
+Runs of the other seeds live in ``work/`` until they are measured; the same command makes any of
+them again. Whatever is interrupted, at whatever moment, the same command or `misstep resume` goes
+on.
+"""
+
+import multiprocessing
+import os
+import shutil
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from misstep.errors import MisstepError
+from misstep.paper import figures, report, tables
+from misstep.paper.claims import Sample, judge_all
+from misstep.paper.experiments import VARIANTS, Variant, run_cell
+from misstep.paper.measures import CellMeasures, measure
+from misstep.paper.results import SHOWN_RUNS, Results, collect_calibration
+from misstep.paper.synthetic import measure_synthetic, run_synthetic
+from misstep.paper.videos import write_videos
+from misstep.runs import load_run, make_folder, read_json
+from misstep.storage import write_json, write_text
+from misstep.version import __version__, command_line
+
+CONFIG = "reproduce.json"
+SEEDS = 30
+QUICK_SEEDS = 5
+
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class ReproductionConfig:
+    """What was asked for."""
+
+    seeds: int
+    seed: int
+    quick: bool
+    version: str = __version__
+
+    @property
+    def variants(self) -> dict[str, Variant]:
+        """The variants to run: all, or with `quick` those that the paper itself shows."""
+        return {name: v for name, v in VARIANTS.items() if v.core or not self.quick}
+
+    @property
+    def command(self) -> str:
+        """The command that gives the same results, wherever they are put."""
+        quick = " --quick" if self.quick else ""
+        return f"misstep reproduce --seeds {self.seeds} --seed {self.seed}{quick}"
+
+
+def reproduce(
+    out: Path,
+    *,
+    seeds: int | None = None,
+    seed: int = 0,
+    quick: bool = False,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Reproduce the paper.
+
+    Parameters
+    ----------
+    out : Path
+        Folder for everything; if it holds the same reproduction already, that one goes on.
+    seeds : int, optional
+        Repetitions, each with its own demonstrations: 30, or 5 with `quick`.
+    seed : int
+        Of the whole; same seed, same tables.
+    quick : bool
+        Only what the paper itself shows, on one calibration.
+    workers : int, optional
+        Processes; one a core if left out. The results do not depend on it.
+    progress : callable, optional
+        Called with how much is done, how much there is, and what was done last.
+
+    Returns
+    -------
+    Path
+        The report.
+
+    Raises
+    ------
+    MisstepError
+        If a number is out of range, the folder cannot be used, or it holds another reproduction.
+    """
+    seeds = (QUICK_SEEDS if quick else SEEDS) if seeds is None else seeds
+    if seeds < 1 or seed < 0:
+        raise MisstepError(f"seeds must be at least 1 and seed at least 0, got {seeds} and {seed}")
+    if workers is not None and workers < 1:
+        raise MisstepError(f"workers is {workers}: at least one process is needed")
+    config = ReproductionConfig(seeds=int(seeds), seed=int(seed), quick=quick)
+    path = out / CONFIG
+    if path.exists():
+        _check_same(path, config)
+    else:
+        make_folder(out)
+        if any(out.glob("[!.]*")):
+            raise MisstepError(f"{out} is not empty: choose a new or an empty folder")
+        write_json(path, {**asdict(config), "command": list(command_line())})
+    return _run(out, config, workers or os.cpu_count() or 1, progress or _silent)
+
+
+def resume(out: Path, *, workers: int | None = None, progress: Progress | None = None) -> Path:
+    """Go on with the reproduction in a folder; see `reproduce`."""
+    values = _read_config(out / CONFIG)
+    return reproduce(
+        out,
+        seeds=values["seeds"],
+        seed=values["seed"],
+        quick=values["quick"],
+        workers=workers,
+        progress=progress,
+    )
+
+
+def _run(out: Path, config: ReproductionConfig, workers: int, progress: Progress) -> Path:
+    cells = [(name, index) for name in config.variants for index in range(config.seeds)]
+    missing = [cell for cell in cells if not _cell_file(out, *cell).exists()]
+    artefacts = figures.FIGURES
+    total = len(cells) + len(artefacts) + 2
+    done = len(cells) - len(missing)
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, context, initializer=_end_with_parent) as pool:
+        job = partial(_run_and_measure, out, config)
+        for future, (name, index) in _completed(pool, job, missing):
+            future.result()
+            done += 1
+            progress(done, total, f"{config.variants[name].title}, seed {index + 1}")
+        results = _gather(out, config)
+        samples = _samples(results)
+        claims = judge_all(samples)
+        make_folder(out / "figures")
+        drawn = {
+            pool.submit(figures.draw, name, out / "figures", results): name for name in artefacts
+        }
+        for future in as_completed(drawn):
+            future.result()
+            done += 1
+            progress(done, total, f"figure {drawn[future]}")
+        videos = write_videos(out / "videos", results, pool)
+        progress(done + 1, total, "videos")
+    document = {
+        "version": config.version,
+        "command": config.command,
+        "parameters": {"seeds": config.seeds, "seed": config.seed, "quick": config.quick},
+        "calibrations": tables.calibrations(results),
+        "tables": tables.all_tables(results),
+        "claims": [claim.to_json() for claim in claims],
+    }
+    write_json(out / "tables.json", document)
+    page = report.render(document, claims, results, out / "figures", videos)
+    write_text(out / "report.html", page)
+    shutil.rmtree(out / "work", ignore_errors=True)
+    progress(total, total, "report")
+    return out / "report.html"
+
+
+def _completed(
+    pool: ProcessPoolExecutor, job: Callable[[str, int], None], cells: Iterable[tuple[str, int]]
+) -> Iterable[tuple[Future[None], tuple[str, int]]]:
+    futures = {pool.submit(job, *cell): cell for cell in cells}
+    for future in as_completed(futures):
+        yield future, futures[future]
+
+
+def _run_and_measure(out: Path, config: ReproductionConfig, name: str, index: int) -> None:
+    """Run one cell and write its measures; runs in a worker."""
+    keep = index == 0
+    folder = out / "runs" / name if keep else out / "work" / f"{name}-{index:03d}"
+    measures = measure(run_cell(folder, VARIANTS[name], config.seed, index))
+    target = _cell_file(out, name, index)
+    make_folder(target.parent)
+    write_json(target, measures.to_json())
+    if not keep:
+        shutil.rmtree(folder)
+
+
+def _cell_file(out: Path, name: str, index: int) -> Path:
+    return out / "cells" / name / f"{index:03d}.json"
+
+
+def _gather(out: Path, config: ReproductionConfig) -> Results:
+    return Results(
+        seed=config.seed,
+        seeds=config.seeds,
+        cells={
+            name: [
+                CellMeasures.from_json(read_json(_cell_file(out, name, index)))
+                for index in range(config.seeds)
+            ]
+            for name in config.variants
+        },
+        runs={name: load_run(out / "runs" / name) for name in SHOWN_RUNS},
+        synthetic=run_synthetic(config.seed),
+        synthetic_measures=[
+            measure_synthetic(run_synthetic(config.seed + index)) for index in range(config.seeds)
+        ],
+        calibrations=collect_calibration(config.seed, quick=config.quick),
+    )
+
+
+def _samples(results: Results) -> Mapping[str, list[Sample]]:
+    """Return the samples of both calibrations, one a seed, by the name of the calibration."""
+    by_physics: dict[str, dict[str, list[CellMeasures]]] = {"A": {}, "B": {}}
+    for name, cells in results.cells.items():
+        by_physics[VARIANTS[name].calibration][name.removeprefix("B-")] = cells
+    return {
+        physics: [
+            Sample(
+                {name: cells[index] for name, cells in variants.items()},
+                results.synthetic_measures[index] if physics == "A" else None,
+            )
+            for index in range(results.seeds)
+        ]
+        for physics, variants in by_physics.items()
+        if variants
+    }
+
+
+def _read_config(path: Path) -> dict[str, Any]:
+    values = read_json(path)
+    kinds = {"seeds": int, "seed": int, "quick": bool, "version": str}
+    if not isinstance(values, dict) or not all(
+        isinstance(values.get(name), kind) for name, kind in kinds.items()
+    ):
+        raise MisstepError(f"{path} is not a reproduction's configuration: delete its folder")
+    return values
+
+
+def _check_same(path: Path, config: ReproductionConfig) -> None:
+    values = _read_config(path)
+    for name, wanted in asdict(config).items():
+        if values[name] != wanted:
+            raise MisstepError(
+                f"{path.parent} holds a reproduction with {name} {values[name]}, not {wanted}: "
+                f"choose another folder"
+            )
+
+
+def _end_with_parent() -> None:
+    """Have a worker end when its parent does, however that ends."""
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _silent(done: int, total: int, what: str) -> None:
+    """Show nothing."""

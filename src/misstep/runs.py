@@ -1,0 +1,242 @@
+"""A run: what was shown, every trial since, and the policy that came out; in memory and on disk.
+
+A run folder holds
+
+    run.json              version, command, system, learner, state, seed: all that rebuilds the run
+    demonstrations.h5     what the run started from
+    policies/trial_000.npz    the policy of each trial, plain arrays
+    trials/trial_000.h5       each finished trial
+
+A trial is finished when its file is there: the file appears in one step, after the policy's. A
+process killed at any instant therefore loses at most the trial in flight.
+"""
+
+import io
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from misstep.errors import MisstepError
+from misstep.formats import load_dataset, save_dataset
+from misstep.learners import LEARNERS, LearnedPolicy, Learner, Task
+from misstep.parameters import ParameterValue, build_parameters
+from misstep.storage import atomic_write, write_json
+from misstep.systems import System, make_system
+from misstep.trajectory import Dataset, Outcome, Trajectory
+from misstep.version import __version__, command_line
+
+CONFIG = "run.json"
+DEMONSTRATIONS = "demonstrations.h5"
+_LARGEST_POLICY = 64 * 2**20
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """All that determines a run, apart from its demonstrations."""
+
+    system: str
+    system_parameters: Mapping[str, ParameterValue]
+    learner: str
+    learner_parameters: Mapping[str, ParameterValue]
+    state: tuple[str, ...]
+    seed: int
+    max_trials: int
+    stop_on_success: bool
+    version: str = __version__
+    command: tuple[str, ...] = field(default_factory=command_line)
+
+    def make_system(self) -> System:
+        """Build the system that the run drives."""
+        return make_system(self.system, **self.system_parameters)
+
+    def make_learner(self) -> Learner:
+        """Build the learner with the run's parameters."""
+        kind = LEARNERS[self.learner]
+        return build_parameters(kind, f"learner {self.learner}", self.learner_parameters)
+
+
+@dataclass
+class Run:
+    """A run as it stands.
+
+    Attributes
+    ----------
+    config : RunConfig
+    demonstrations : Dataset
+    trials : list of Trajectory
+    policies : list of LearnedPolicy
+        The policy of each trial.
+    computing_seconds : list of float
+        Wall-clock time that each policy took to learn, s.
+    folder : Path or None
+        Where the run is kept.
+    """
+
+    config: RunConfig
+    demonstrations: Dataset
+    trials: list[Trajectory] = field(default_factory=list)
+    policies: list[LearnedPolicy] = field(default_factory=list)
+    computing_seconds: list[float] = field(default_factory=list)
+    folder: Path | None = None
+
+    @property
+    def policy(self) -> LearnedPolicy:
+        """The policy of the last trial.
+
+        Raises
+        ------
+        MisstepError
+            If there has been no trial.
+        """
+        if not self.policies:
+            raise MisstepError("the run has no trial yet, and so no policy: resume it first")
+        return self.policies[-1]
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether a trial has succeeded."""
+        return self.trials_to_success is not None
+
+    @property
+    def trials_to_success(self) -> int | None:
+        """Number of trials up to and including the first success; None before that."""
+        for number, trial in enumerate(self.trials, start=1):
+            if trial.outcome is Outcome.SUCCESS:
+                return number
+        return None
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing is left to do."""
+        enough = len(self.trials) >= self.config.max_trials
+        return enough or (self.config.stop_on_success and self.succeeded)
+
+    def add(self, policy: LearnedPolicy, trial: Trajectory, seconds: float) -> None:
+        """Append a finished trial, on disk first if the run has a folder."""
+        if self.folder is not None:
+            name = f"trial_{len(self.trials):03d}"
+            arrays = {**policy.arrays(), "computing_seconds": np.array(seconds)}
+            _save_arrays(self.folder / "policies" / f"{name}.npz", arrays)
+            save_dataset(Dataset([trial]), self.folder / "trials" / f"{name}.h5")
+        self.policies.append(policy)
+        self.trials.append(trial)
+        self.computing_seconds.append(seconds)
+
+    def keep_in(self, folder: str | os.PathLike[str]) -> Self:
+        """Make the run's folder; trials added from now on are kept in it.
+
+        Raises
+        ------
+        MisstepError
+            If there is a run already, the folder holds something else, or cannot be written.
+        """
+        path = Path(folder)
+        if (path / CONFIG).exists():
+            raise MisstepError(f"{path} holds a run already: resume it, or choose another folder")
+        make_folder(path)
+        if any(path.glob("[!.]*")) and not (path / DEMONSTRATIONS).exists():
+            raise MisstepError(f"{path} is not empty: choose a new or an empty folder for the run")
+        make_folder(path / "policies")
+        make_folder(path / "trials")
+        save_dataset(self.demonstrations, path / DEMONSTRATIONS)
+        # Written last: a folder with a configuration is a run, whole.
+        write_json(path / CONFIG, asdict(self.config))
+        self.folder = path
+        return self
+
+
+def load_run(folder: str | os.PathLike[str]) -> Run:
+    """Load a run from its folder.
+
+    Parameters
+    ----------
+    folder : path
+        As `learn` wrote it with ``out``.
+
+    Returns
+    -------
+    Run
+        With every finished trial and its policy.
+
+    Raises
+    ------
+    MisstepError
+        If the folder is no run or a file in it is damaged.
+    """
+    path = Path(folder)
+    config = _load_config(path / CONFIG)
+    run = Run(config, load_dataset(path / DEMONSTRATIONS), folder=path)
+    task = Task.of(config.make_system(), config.state)
+    restore = LEARNERS[config.learner].restore
+    for index, file in enumerate(sorted((path / "trials").glob("trial_*.h5"))):
+        name = f"trial_{index:03d}"
+        if file.stem != name:
+            raise MisstepError(f"{path}: trials/{name}.h5 is missing, but {file.name} is there")
+        arrays = _load_arrays(path / "policies" / f"{name}.npz")
+        try:
+            run.policies.append(restore(task, arrays))
+            run.computing_seconds.append(float(arrays["computing_seconds"]))
+        except KeyError as error:
+            raise MisstepError(f"{path}: policies/{name}.npz lacks the array {error}") from error
+        run.trials.append(load_dataset(file)[0])
+    return run
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it; raise MisstepError where that is not possible."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise MisstepError(f"cannot make the folder {path}: {error.strerror}") from error
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file; raise MisstepError if it is missing or damaged."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise MisstepError(f"cannot read {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise MisstepError(f"{path} is not valid JSON: {error}") from error
+
+
+def _load_config(path: Path) -> RunConfig:
+    if not path.exists():
+        raise MisstepError(f"{path.parent} is not a run folder: it has no {CONFIG}")
+    values = read_json(path)
+    names = set(RunConfig.__dataclass_fields__)
+    if not isinstance(values, dict) or set(values) != names:
+        raise MisstepError(f"{path} is not a run's configuration: it needs {sorted(names)}")
+    try:
+        lists = {name: tuple(map(str, values[name])) for name in ("state", "command")}
+        numbers = {name: int(values[name]) for name in ("seed", "max_trials")}
+        tables = {name: dict(values[name]) for name in ("system_parameters", "learner_parameters")}
+    except (TypeError, ValueError) as error:
+        raise MisstepError(f"{path} is not a run's configuration: {error}") from error
+    return RunConfig(**{**values, **lists, **numbers, **tables})
+
+
+def _save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **arrays)
+    atomic_write(path, lambda temporary: temporary.write_bytes(buffer.getvalue()))
+
+
+def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    try:
+        if path.stat().st_size > _LARGEST_POLICY:
+            raise MisstepError(f"{path} is larger than any policy: {path.stat().st_size} bytes")
+        with zipfile.ZipFile(path) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > _LARGEST_POLICY:
+                raise MisstepError(f"{path} unpacks to more than any policy holds")
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise MisstepError(f"cannot read {path}: {' '.join(str(error).split())}") from error

@@ -1,0 +1,102 @@
+"""Files that are either old or new, never half.
+
+A file is written under a temporary name on the same file system, flushed to the disk, and then
+renamed over the old one in a single step. Whoever reads sees the old file or the new one; a
+process killed at any instant leaves at worst a hidden folder ``.NAME.XXXX.tmp`` behind.
+"""
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from misstep.errors import MisstepError
+
+
+def atomic_write(path: str | os.PathLike[str], write: Callable[[Path], object]) -> None:
+    """Create or replace a file in a single step.
+
+    The temporary file bears the final name, in a hidden folder beside the final place: writers
+    that go by the suffix (pictures, videos, npz) see the right one, and a search for ``*.h5``
+    never finds a file in the making.
+
+    Parameters
+    ----------
+    path : path
+        The file to write. A symbolic link is followed, so that the link itself stays.
+    write : callable
+        Called with the path of the temporary file, which it has to create.
+
+    Raises
+    ------
+    MisstepError
+        If the system refuses: no such folder, no permission, a full disk. Whatever else `write`
+        raises passes through. In either case the old file is untouched.
+    """
+    target = Path(os.path.realpath(path))
+    if target.is_dir():
+        raise MisstepError(f"cannot write {path}: it is a folder; name a file")
+    try:
+        folder = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent))
+        try:
+            temporary = folder / target.name
+            write(temporary)
+            if target.exists():
+                shutil.copymode(target, temporary)
+            _flush(temporary)
+            temporary.replace(target)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+        _flush(target.parent)
+    except OSError as error:
+        reason = " ".join(str(error.strerror or error).split())
+        raise MisstepError(
+            f"cannot write {path}: {reason}; choose a folder that exists and can be written to"
+        ) from error
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    r"""Write a text file in UTF-8 in a single step, with ``\n`` at the ends of lines.
+
+    Raises
+    ------
+    MisstepError
+        As `atomic_write`.
+    """
+    atomic_write(path, lambda temporary: temporary.write_bytes(text.encode()))
+
+
+def write_json(path: str | os.PathLike[str], value: object, *, sort_keys: bool = False) -> None:
+    """Write a JSON file in a single step, indented, in UTF-8.
+
+    Parameters
+    ----------
+    path : path
+        The file to write.
+    value : object
+        Dictionaries, lists, strings, numbers, truth values and None.
+    sort_keys : bool
+        Sort the keys of dictionaries, so that equal values give equal files.
+
+    Raises
+    ------
+    MisstepError
+        If `value` holds NaN, an infinity or something that JSON cannot say, or as
+        `atomic_write`.
+    """
+    try:
+        text = json.dumps(value, allow_nan=False, indent=2, sort_keys=sort_keys)
+    except (TypeError, ValueError) as error:
+        raise MisstepError(f"cannot write {path} as JSON: {error}") from error
+    write_text(path, text + "\n")
+
+
+def _flush(path: Path) -> None:
+    """Have the system bring a file or a folder onto the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,47 @@
+"""What misstep asks of a system: a Gymnasium environment that knows its columns and its past.
+
+A system is an ordinary `gymnasium.Env` with `Box` spaces. What it says beyond that lets a recorded
+trajectory explain itself: what each column is, in which unit, how long a step takes, and with which
+parameters the same system can be built again.
+"""
+
+from typing import ClassVar
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from misstep.parameters import ParameterValue
+from misstep.trajectory import Column
+
+
+class System(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
+    """A Gymnasium environment with `Box` spaces that describes itself.
+
+    `step` returns minus the cost of the step as its reward, and in its `info`
+
+    - ``failed`` (bool): the failure predicate has held at some time in this episode;
+    - ``success`` (bool): the task is done.
+
+    `reset` returns ``failed`` in its `info` too: an episode can start in a failure.
+
+    Attributes
+    ----------
+    system_id : str
+        Name in the registry of systems.
+    parameters_type : type
+        Dataclass of the constructor's parameters, see `misstep.parameters`.
+    dt : float, s
+        Control period.
+    observation_columns : tuple of Column, length n
+    action_columns : tuple of Column, length m
+    parameters : dict
+        Every parameter of the constructor: enough to build the same system again.
+    """
+
+    system_id: ClassVar[str]
+    parameters_type: ClassVar[type]
+    dt: float
+    observation_columns: tuple[Column, ...]
+    action_columns: tuple[Column, ...]
+    parameters: dict[str, ParameterValue]

@@ -1,0 +1,47 @@
+import os
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from hypothesis import settings
+
+from misstep import MisstepError, demonstrate, make_system
+
+settings.register_profile("default", deadline=None, derandomize=True, max_examples=100)
+settings.register_profile("nightly", deadline=None, max_examples=2000)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
+
+
+@pytest.fixture(scope="session")
+def refused():
+    """Expect a MisstepError of one line whose message matches."""
+
+    @contextmanager
+    def expect(match):
+        with pytest.raises(MisstepError, match=match) as caught:
+            yield
+        assert "\n" not in str(caught.value)
+
+    return expect
+
+
+@pytest.fixture(scope="session")
+def random_mixture():
+    """Draw weights (K,), means (K, d) and covariances (K, d, d) of overlapping components."""
+
+    def draw(rng, K, d, spread=2.0):
+        factors = rng.normal(size=(K, d, d)) / np.sqrt(d)
+        covariances = factors @ factors.transpose(0, 2, 1) + 0.1 * np.eye(d)
+        return rng.dirichlet(np.full(K, 3.0)), spread * rng.normal(size=(K, d)), covariances
+
+    return draw
+
+
+@pytest.fixture(scope="session")
+def cartpole():
+    return make_system("cartpole")
+
+
+@pytest.fixture(scope="session")
+def demonstrations(cartpole):
+    return demonstrate(cartpole, by="weak", n=3, seed=0)
