@@ -347,7 +347,7 @@ def test_wrong_actions_are_told(action, line):
 
 
 def test_a_simulation_too_coarse_to_mean_anything_is_told():
-    system = CartPole(force_limit=1e5, stop_at_fall=False)
+    system = CartPole(force_limit=1e5, stop_at_fall=False, rail=10.0)
     system.reset(seed=0)
     with pytest.raises(
         MisstepError, match=r"after 0\.02 s the pole turns at .* physics_step of 0\.01"

@@ -269,7 +269,7 @@ NOWHERE = ("--out", "D.h5/sub/x.h5")  # below a file: even the administrator can
         ((*LEARN, "--from", "D.h5", "--set", "pole_mass=-1"), ["-1 kg", "greater than 0 kg"]),
         ((*LEARN, "--from", "D.h5", "--set", "stop_at_fall=3"), ["3", "true or false"]),
         ((*LEARN, "--from", "D.h5", "--set", "control_rate=25"), ["0.02 s", "0.04 s"]),
-        ((*LEARN, "--from", "D.h5", "--with", "climb=up"), ["'up'", "warm, global"]),
+        ((*LEARN, "--from", "D.h5", "--with", "climb=up"), ["'up'", "warm, density, global"]),
         ((*LEARN, "--from", "D.h5", "--with", "k=1", "--with", "k=3"), ["k", "twice"]),
         ((*LEARN, "--from", "D.h5", *NOWHERE), ["D.h5/sub"]),
         ((*LEARN, "--from", "D.h5", "--json", "D.h5/r.json"), ["--json", "folder D.h5"]),

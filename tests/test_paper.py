@@ -94,14 +94,14 @@ def test_an_interrupted_cell_goes_on_to_the_same_end(tmp_path):
     variant = VARIANTS["without-reward"]
     whole_run = run_cell(tmp_path / "a", variant, seed=0, index=0)
 
-    class Stop(Exception):
+    class StopError(Exception):
         pass
 
     def stop(run):
         if len(run.trials) == 4:
-            raise Stop
+            raise StopError
 
-    with pytest.raises(Stop):
+    with pytest.raises(StopError):
         run_cell(tmp_path / "b", variant, seed=0, index=0, on_trial=stop)
     resumed = run_cell(tmp_path / "b", variant, seed=0, index=0)
     for ours, theirs in zip(whole_run.trials, resumed.trials, strict=True):

@@ -98,7 +98,7 @@ def test_picture_follows_the_cart_along_marks(draw):
     assert np.abs(here - one_period_on).max() < 60
     assert np.abs(here - one_period_on).mean() < 0.05
     assert np.abs(here - half_a_mark_on).mean() > 0.3
-    assert np.abs(here - draw(x=9.5)).mean() > 0.5  # a stop has come into view
+    assert np.abs(here - draw(x=999.5)).mean() > 0.5  # a stop has come into view
 
 
 def test_environment_renders_what_it_simulates():

@@ -20,7 +20,7 @@ from misstep.parameters import ParameterValue
 from misstep.rollout import Policy, rollout
 from misstep.runs import Run, RunConfig
 from misstep.systems import System
-from misstep.trajectory import Dataset, Outcome
+from misstep.trajectory import Column, Dataset, Outcome
 
 _Z_95 = 1.959963984540054
 
@@ -115,7 +115,7 @@ def resume(run: Run, *, system: System | None = None, on_trial: OnTrial | None =
     """
     system = run.config.make_system() if system is None else system
     learner = run.config.make_learner()
-    task = Task.of(system, run.config.state)
+    task = Task.of(system, run.config.state).seen_from(learner.rung)
     while not run.finished:
         stream = np.random.SeedSequence(run.config.seed, spawn_key=(len(run.trials),))
         learning, acting = stream.spawn(2)
@@ -207,14 +207,17 @@ def _nothing_half_made(run: Run, out: str | os.PathLike[str] | None) -> Iterator
         raise
 
 
+def _listing(columns: Sequence[Column]) -> str:
+    return ", ".join(f"{column.name} [{column.unit}]" for column in columns)
+
+
 def _check_fit(system: System, demonstrations: Dataset) -> None:
     for kind in ("observation_columns", "action_columns"):
         shown, driven = getattr(demonstrations, kind), getattr(system, kind)
         if shown != driven:
             raise MisstepError(
                 f"the demonstrations have the {kind.replace('_', ' ')} "
-                f"{', '.join(c.name for c in shown)}, but {system.system_id} has "
-                f"{', '.join(c.name for c in driven)}"
+                f"{_listing(shown)}, but {system.system_id} has {_listing(driven)}"
             )
     if not math.isclose(demonstrations.dt, system.dt, rel_tol=1e-9):
         raise MisstepError(

@@ -14,7 +14,9 @@ process killed at any instant therefore loses at most the trial in flight.
 import io
 import json
 import os
+import struct
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -35,6 +37,37 @@ from misstep.version import __version__, command_line
 CONFIG = "run.json"
 DEMONSTRATIONS = "demonstrations.h5"
 _LARGEST_POLICY = 64 * 2**20
+
+_CONFIG_KINDS = {
+    "system": str,
+    "system_parameters": dict,
+    "learner": str,
+    "learner_parameters": dict,
+    "state": list,
+    "seed": int,
+    "max_trials": int,
+    "stop_on_success": bool,
+    "version": str,
+    "command": list,
+}
+_JSON_NAMES = {str: "string", dict: "object", list: "array", int: "whole number", bool: "boolean"}
+
+# What zipfile and NumPy raise when an npz file is damaged, depending on where.
+_DAMAGE = (
+    EOFError,
+    KeyError,
+    MemoryError,
+    NotImplementedError,
+    OSError,
+    OverflowError,
+    RuntimeError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+    struct.error,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 @dataclass(frozen=True)
@@ -141,7 +174,10 @@ class Run:
         if (path / CONFIG).exists():
             raise MisstepError(f"{path} holds a run already: resume it, or choose another folder")
         make_folder(path)
-        if any(path.glob("[!.]*")) and not (path / DEMONSTRATIONS).exists():
+        # What this very function leaves behind when it is killed may stay.
+        own = {DEMONSTRATIONS, "policies", "trials"}
+        others = {file.name for file in path.glob("[!.]*")} - own
+        if others or any((path / "trials").glob("[!.]*")):
             raise MisstepError(f"{path} is not empty: choose a new or an empty folder for the run")
         make_folder(path / "policies")
         make_folder(path / "trials")
@@ -173,18 +209,22 @@ def load_run(folder: str | os.PathLike[str]) -> Run:
     path = Path(folder)
     config = _load_config(path / CONFIG)
     run = Run(config, load_dataset(path / DEMONSTRATIONS), folder=path)
-    task = Task.of(config.make_system(), config.state)
-    restore = LEARNERS[config.learner].restore
-    for index, file in enumerate(sorted((path / "trials").glob("trial_*.h5"))):
+    learner = LEARNERS[config.learner]
+    task = Task.of(config.make_system(), config.state).seen_from(learner.rung)
+    files = (path / "trials").glob("trial_*.h5")
+    for index, file in enumerate(sorted(files, key=lambda file: (len(file.stem), file.stem))):
         name = f"trial_{index:03d}"
         if file.stem != name:
             raise MisstepError(f"{path}: trials/{name}.h5 is missing, but {file.name} is there")
         arrays = _load_arrays(path / "policies" / f"{name}.npz")
         try:
-            run.policies.append(restore(task, arrays))
+            run.policies.append(learner.restore(task, arrays))
             run.computing_seconds.append(float(arrays["computing_seconds"]))
         except KeyError as error:
             raise MisstepError(f"{path}: policies/{name}.npz lacks the array {error}") from error
+        except (TypeError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise MisstepError(f"{path}: policies/{name}.npz holds no policy: {reason}") from error
         run.trials.append(load_dataset(file)[0])
     return run
 
@@ -203,7 +243,7 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise MisstepError(f"cannot read {path}: {error.strerror}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise MisstepError(f"{path} is not valid JSON: {error}") from error
 
 
@@ -214,13 +254,17 @@ def _load_config(path: Path) -> RunConfig:
     names = set(RunConfig.__dataclass_fields__)
     if not isinstance(values, dict) or set(values) != names:
         raise MisstepError(f"{path} is not a run's configuration: it needs {sorted(names)}")
-    try:
-        lists = {name: tuple(map(str, values[name])) for name in ("state", "command")}
-        numbers = {name: int(values[name]) for name in ("seed", "max_trials")}
-        tables = {name: dict(values[name]) for name in ("system_parameters", "learner_parameters")}
-    except (TypeError, ValueError) as error:
-        raise MisstepError(f"{path} is not a run's configuration: {error}") from error
-    return RunConfig(**{**values, **lists, **numbers, **tables})
+    for name, kind in _CONFIG_KINDS.items():
+        if type(values[name]) is not kind:
+            raise MisstepError(f"{path}: {name} must be a JSON {_JSON_NAMES[kind]}")
+    lists = {name: tuple(map(str, values[name])) for name in ("state", "command")}
+    config = RunConfig(**{**values, **lists})
+    if config.seed < 0 or config.max_trials < 1:
+        raise MisstepError(
+            f"{path}: seed is {config.seed} and max_trials is {config.max_trials}, but they are at "
+            f"least 0 and 1"
+        )
+    return config
 
 
 def _save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -238,5 +282,5 @@ def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
                 raise MisstepError(f"{path} unpacks to more than any policy holds")
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except _DAMAGE as error:
         raise MisstepError(f"cannot read {path}: {' '.join(str(error).split())}") from error

@@ -8,7 +8,7 @@ checks nothing again.
 import math
 import operator
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from datetime import datetime
 from enum import StrEnum
 from types import MappingProxyType
@@ -210,6 +210,25 @@ class Trajectory:
     def failure_time(self) -> float | None:
         """When the failure predicate first held, s from the start; None if it never did."""
         return None if self.failure_step is None else self.failure_step * self.dt
+
+    def cut(self, step: int) -> "Trajectory":
+        """Return the first `step` actions and the observations around them.
+
+        Raises
+        ------
+        MisstepError
+            If `step` is not from 1 to the number of actions.
+        """
+        if not 1 <= step <= self.n_steps:
+            raise MisstepError(f"cannot cut at step {step}: there are {self.n_steps} actions")
+        failed = self.failure_step is not None and self.failure_step <= step
+        return replace(
+            self,
+            observations=self.observations[: step + 1],
+            actions=self.actions[:step],
+            costs=None if self.costs is None else self.costs[:step],
+            failure_step=self.failure_step if failed else None,
+        )
 
     def column(self, name: str) -> FloatArray:
         """Return one column of the observations.

@@ -2,6 +2,7 @@
 
 from misstep.learners.donut import DonutLearner, DonutPolicy
 from misstep.learners.donut_cost import DonutCostLearner
+from misstep.learners.fall import Fall
 from misstep.learners.learner import LEARNERS, Evidence, LearnedPolicy, Learner, Task
 from misstep.learners.mean import Mean, MeanPolicy
 from misstep.learners.mixtures import MixturePolicy
@@ -12,6 +13,7 @@ __all__ = [
     "DonutLearner",
     "DonutPolicy",
     "Evidence",
+    "Fall",
     "LearnedPolicy",
     "Learner",
     "Mean",

@@ -8,7 +8,7 @@ Every failure counts the same.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +23,7 @@ from misstep.learners.mixtures import (
 )
 from misstep.mixture import DonutMixture, GaussianMixture, compiled, exploration_from_variance
 from misstep.mixture.donut import DEFAULT_K, DEFAULT_REACH, check_family
-from misstep.mixture.donut_mixture import component_arrays
+from misstep.mixture.donut_mixture import FORMULAS, component_arrays
 from misstep.parameters import check_parameters, parameter
 from misstep.trajectory import Trajectory
 
@@ -31,8 +31,7 @@ Array = NDArray[np.float64]
 
 # How far demonstrated actions spread, times this, is the disagreement that counts as half.
 SCALE_SHARE = 0.3
-CLIMBS = ("warm", "global")
-FORMULAS = ("prose", "printed")
+CLIMBS = ("warm", "density", "global")
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,8 @@ class DonutParameters(MixtureParameters):
     climb: str = parameter(
         "warm",
         "",
-        "warm: climb from the previous action, as in the paper; global: from the best candidate",
+        "warm: up the log density from the previous action; density: up the density itself, as in "
+        "the paper, so that the action stays where that is flat; global: from the best candidate",
     )
     formula: str = parameter(
         "prose", "", "exploration as the paper's text describes it, or as its equation is printed"
@@ -71,8 +71,8 @@ class DonutParameters(MixtureParameters):
     @staticmethod
     def restore(task: Task, arrays: Mapping[str, Array]) -> "DonutPolicy":
         """Return the policy that `DonutPolicy.arrays` described."""
-        k, reach, warm, printed = arrays["settings"]
-        settings = (float(k), float(reach), bool(warm), bool(printed))
+        k, reach, climb, formula = arrays["settings"].tolist()
+        settings = DonutSettings(k, reach, CLIMBS[int(climb)], FORMULAS[int(formula)])
         return DonutPolicy(task, restore_mixture(arrays), arrays["scale"], settings)
 
     def act_on(
@@ -84,8 +84,17 @@ class DonutParameters(MixtureParameters):
         if self.scale == 0.0:
             shown = np.concatenate([t.actions for t in demonstrations])
             scale = SCALE_SHARE * shown.std(axis=0)
-        settings = (self.k, self.reach, self.climb == "warm", self.formula == "printed")
+        settings = DonutSettings(self.k, self.reach, self.climb, self.formula)
         return DonutPolicy(task, mixture, scale, settings)
+
+
+class DonutSettings(NamedTuple):
+    """What a donut policy does with its mixture; see `DonutParameters`."""
+
+    k: float
+    reach: float
+    climb: str
+    formula: str
 
 
 class DonutPolicy(MixturePolicy):
@@ -97,9 +106,12 @@ class DonutPolicy(MixturePolicy):
     mixture : GaussianMixture
     scale : ndarray, shape (m,)
         s, in the action's unit.
-    settings : tuple
-        k, reach, whether the climb starts from the previous action, and whether ε is the paper's
-        formula as printed.
+    settings : DonutSettings
+
+    Raises
+    ------
+    MisstepError
+        If the mixture has other columns than the task, or a number is out of its range.
 
     Attributes
     ----------
@@ -112,9 +124,13 @@ class DonutPolicy(MixturePolicy):
         task: Task,
         mixture: GaussianMixture,
         scale: Array,
-        settings: tuple[float, float, bool, bool],
+        settings: DonutSettings,
     ) -> None:
         super().__init__(task, mixture)
+        m = len(task.action_columns)
+        if scale.shape != (m,) or not np.all((scale > 0) & (scale < np.inf)):
+            raise MisstepError(f"the policy's scale must be {m} positive numbers, got {scale}")
+        check_family(settings.k, settings.reach)
         self.scale = scale
         self.settings = settings
         c = self.conditioner
@@ -137,12 +153,13 @@ class DonutPolicy(MixturePolicy):
 
     def __call__(self, observation: Array, /) -> Array:
         """Return the mode, clipped; the next climb starts from there."""
-        k, reach, warm, printed = self.settings
+        k, reach, climb, formula = self.settings
         self.exploration = compiled.explore(
             self.state_of(observation),
             self._action,
-            warm and not self._first,
-            printed,
+            climb != "global" and not self._first,
+            climb == "density",
+            formula == "printed",
             k,
             reach,
             self.scale,
@@ -154,16 +171,15 @@ class DonutPolicy(MixturePolicy):
 
     def donut_at(self, state: ArrayLike) -> DonutMixture:
         """Return the donut mixture at `state` (n,), for looking at and measuring."""
-        k, reach, _, printed = self.settings
+        k, reach, _, formula = self.settings
         conditional = self.conditioner.at(state)
-        exploration = exploration_from_variance(
-            conditional.variance, self.scale, "printed" if printed else "prose"
-        )
+        exploration = exploration_from_variance(conditional.variance, self.scale, formula)
         return DonutMixture(conditional, exploration, k, reach)
 
     def arrays(self) -> dict[str, Array]:
         """Return the mixture's parameters, s and the settings."""
-        settings = np.array(self.settings, dtype=np.float64)
+        k, reach, climb, formula = self.settings
+        settings = np.array([k, reach, CLIMBS.index(climb), FORMULAS.index(formula)])
         return super().arrays() | {"scale": self.scale, "settings": settings}
 
 

@@ -52,14 +52,23 @@ class DonutCostLearner(DonutParameters):
         self, task: Task, attempts: Sequence[Trajectory], shares: Array, rng: np.random.Generator
     ) -> GaussianMixture:
         """As many samples as there were steps, shared out by cost among the attempts' mixtures."""
-        total = sum(t.n_steps for t in attempts)
+        samples = joint_samples(task, attempts)
+        ends = np.cumsum([t.n_steps for t in attempts])
         drawn = []
-        for attempt, share in zip(attempts, shares, strict=True):
-            count = round(share * total)
-            mixture = self.fit(joint_samples(task, [attempt]), rng)
+        for own, share in zip(np.split(samples, ends[:-1]), shares, strict=True):
+            count = round(share * len(samples))
             if count:
-                drawn.append(mixture.sample(count, rng)[0])
+                drawn.append(self._samples_like(own, count, rng))
         return self.fit(np.concatenate(drawn), rng)
+
+    def _samples_like(self, samples: Array, count: int, rng: np.random.Generator) -> Array:
+        """Draw from the mixture of one attempt; a column that never varies in it stays as it is."""
+        drawn = np.tile(samples[0], (count, 1))
+        varying = np.ptp(samples, axis=0) > 0
+        if varying.any():
+            mixture = self.fit(samples[:, varying], rng)
+            drawn[:, varying] = mixture.sample(count, rng)[0]
+        return drawn
 
     def _from_weights(
         self, task: Task, attempts: Sequence[Trajectory], shares: Array, rng: np.random.Generator

@@ -25,6 +25,7 @@ from typing import Any, ClassVar, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from misstep.costs import StateCost
 from misstep.errors import MisstepError
 from misstep.registry import Registry
 from misstep.rollout import Policy
@@ -46,6 +47,10 @@ class Task:
     """Largest action, shape (m,)."""
     state: tuple[str, ...]
     """Names of the observation columns that the policy may depend on."""
+    dt: float
+    """Control period, s."""
+    cost: StateCost | None = None
+    """Cost of a whole observation as a function, where the user supplies one; for rung 4 alone."""
 
     @classmethod
     def of(cls, system: System, state: Sequence[str] | None = None) -> Self:
@@ -71,7 +76,18 @@ class Task:
             np.array(space.low, dtype=np.float64),
             np.array(space.high, dtype=np.float64),
             chosen,
+            system.dt,
+            system.cost,
         )
+
+    def seen_from(self, rung: int) -> "Task":
+        """Return the task as a learner of that rung may see it."""
+        return self if rung >= 4 else replace(self, cost=None)
+
+    @property
+    def angles(self) -> NDArray[np.bool_]:
+        """Which observation columns wrap around: those in rad, shape (columns,)."""
+        return np.array([column.unit == "rad" for column in self.observation_columns])
 
     @property
     def state_indices(self) -> NDArray[np.intp]:

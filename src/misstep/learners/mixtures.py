@@ -67,9 +67,20 @@ class MixturePolicy:
     task : Task
     mixture : GaussianMixture
         Fitted on the columns (state, action) in that order.
+
+    Raises
+    ------
+    MisstepError
+        If the mixture has other columns.
     """
 
     def __init__(self, task: Task, mixture: GaussianMixture) -> None:
+        n, m, columns = len(task.state), len(task.action_columns), mixture.means_.shape[1]
+        if columns != n + m:
+            raise MisstepError(
+                f"the policy's mixture has {columns} columns, but the task has {n} of state and "
+                f"{m} of action"
+            )
         self.task = task
         self.mixture = mixture
         self.conditioner = Conditioner(mixture, range(len(task.state)))

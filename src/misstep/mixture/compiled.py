@@ -393,11 +393,10 @@ def mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, metric):
         gradient[i] = 0.0
         for j in range(d):
             metric[i, j] = 0.0
-    if top == -np.inf:
-        return top
+    silent = top == -np.inf
     total = 0.0
     for k in range(n_components):
-        value[k] = math.exp(value[k] - top)
+        value[k] = (1.0 if k == 0 else 0.0) if silent else math.exp(value[k] - top)
         total += value[k]
     for k in range(n_components):
         rho = value[k] / total
@@ -442,19 +441,21 @@ def solve_definite(matrix, right, out):
 
 LONGEST_STEP = 0.5
 SHORTEST_STEP = 1e-7
+NUDGE = 1e-3
 MAX_ASCENT = 500
 
 
 @njit(cache=True)
-def ascend(a, log_h, m, whiteners, lowers, log_norms, shape):
+def ascend(a, log_h, m, whiteners, log_norms, shape):
     """Climb from `a` (overwritten) to a local maximum of the donut mixture; return its log density.
 
     Gradient ascent in the metric of the components that matter where it stands, with backtracking.
-    No step is longer than half a standard deviation, so the climb stays on the hill it starts on.
-    Exactly at a centre the gradient vanishes although the centre may be a pit: there, and only
-    there, the start is moved by a thousandth of a standard deviation.
+    No step is longer than half a standard deviation, so the climb stays on the hill it starts on;
+    only more than ten out, where there are no hills, it strides. At a centre the gradient vanishes
+    although the centre may be a pit: a start without a slope is moved by a thousandth of a standard
+    deviation.
     """
-    n_components, d = m.shape
+    d = m.shape[1]
     gradient = np.empty(d)
     metric = np.empty((d, d))
     step = np.empty(d)
@@ -462,16 +463,13 @@ def ascend(a, log_h, m, whiteners, lowers, log_norms, shape):
     trial_gradient = np.empty(d)
     trial_metric = np.empty((d, d))
     value = mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, metric)
-    flat = True
+    solve_definite(metric, gradient, step)
+    squared = 0.0
     for i in range(d):
-        flat = flat and gradient[i] == 0.0
-    if flat:
-        nearest = 0
-        for k in range(1, n_components):
-            if log_h[k] > log_h[nearest]:
-                nearest = k
+        squared += step[i] * gradient[i]
+    if squared < SHORTEST_STEP**2:
         for i in range(d):
-            a[i] += 1e-3 * lowers[nearest, i, 0]
+            a[i] += NUDGE / math.sqrt(metric[i, i])
         value = mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, metric)
     length = 1.0
     for _ in range(MAX_ASCENT):
@@ -484,7 +482,9 @@ def ascend(a, log_h, m, whiteners, lowers, log_norms, shape):
         norm = math.sqrt(max(squared, 0.0))
         if norm < SHORTEST_STEP:
             break
-        length = min(length, LONGEST_STEP / norm)
+        # In units of the slope: a longer last step may have become too short where it is gentler.
+        length = max(length, min(1.0, 10.0 * SHORTEST_STEP / norm))
+        length = min(length, max(LONGEST_STEP, 0.25 * norm - 2.0) / norm)
         while length * norm >= SHORTEST_STEP:
             for i in range(d):
                 trial[i] = a[i] + length * step[i]
@@ -496,11 +496,15 @@ def ascend(a, log_h, m, whiteners, lowers, log_norms, shape):
             length *= 0.5
         else:
             break
+        # Barzilai–Borwein: the next length from the curvature just met, or twice as long if none.
+        curvature = 0.0
+        for i in range(d):
+            curvature += length * step[i] * (gradient[i] - trial_gradient[i])
+        length = length * length * squared / curvature if curvature > 0.0 else 2.0 * length
         a[:] = trial
         value = trial_value
         gradient[:] = trial_gradient
         metric[:] = trial_metric
-        length *= 2.0
     return value
 
 
@@ -544,6 +548,7 @@ def explore(
     state,
     action,
     warm,
+    flat_stays,
     printed,
     k,
     reach,
@@ -561,7 +566,8 @@ def explore(
     """Condition on `state`, choose ε, climb the donut mixture; overwrite `action`, return ε.
 
     With `warm` the climb starts from the `action` that comes in, otherwise from the best analytic
-    candidate. `printed` takes ε = 1/(1 + V/s²), the paper's formula as printed.
+    candidate. With `flat_stays` the action stays where it is if the density there is zero in double
+    precision. `printed` takes ε = 1/(1 + V/s²), the paper's formula as printed.
     """
     n_components, d = action_means.shape
     h = np.empty(n_components)
@@ -574,5 +580,10 @@ def explore(
         h[i] = math.log(max(h[i], 1e-300))
     if not warm:
         best_candidate(action, h, m, whiteners, lowers, log_norms, shape, ridge)
-    ascend(action, h, m, whiteners, lowers, log_norms, shape)
+    elif flat_stays:
+        gradient, metric = np.empty(d), np.empty((d, d))
+        value = mixture_density(action, h, m, whiteners, log_norms, shape, gradient, metric)
+        if math.exp(value) == 0.0:
+            return exploration
+    ascend(action, h, m, whiteners, log_norms, shape)
     return exploration

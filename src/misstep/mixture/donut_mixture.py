@@ -3,8 +3,6 @@
 DMM(a | ξ) = Σ_k h_k(ξ) D(a; m_k, S_k, ε(ξ)), with one ε per state.
 """
 
-from typing import Literal
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -15,11 +13,11 @@ from misstep.mixture.conditional import Conditional
 from misstep.mixture.donut import DEFAULT_K, DEFAULT_REACH, DonutShape
 
 Array = NDArray[np.float64]
-Formula = Literal["prose", "printed"]
+FORMULAS = ("prose", "printed")
 
 
 def exploration_from_variance(
-    variance: ArrayLike, scale: ArrayLike, formula: Formula = "prose"
+    variance: ArrayLike, scale: ArrayLike, formula: str = "prose"
 ) -> float:
     """How much to explore where the demonstrators differ by `variance`.
 
@@ -38,11 +36,23 @@ def exploration_from_variance(
     -------
     exploration : float
         From 0 to 1. With several action columns, V/s² is the mean of V_ii/s_i².
+
+    Raises
+    ------
+    MisstepError
+        If the shapes disagree, a value is not finite or not positive, or there is no such formula.
     """
     v, s = np.array(variance, dtype=np.float64), np.array(scale, dtype=np.float64)
-    if v.ndim != 2 or s.shape != (len(v),) or not np.all(s > 0):
+    if formula not in FORMULAS:
+        raise MisstepError(f"the formula is 'prose' or 'printed', got {formula!r}")
+    if s.ndim != 1 or v.shape != 2 * s.shape or not np.all((s > 0) & (s < np.inf)):
         raise MisstepError(
-            f"exploration takes a variance (d, d) and a positive scale (d,), got {v.shape} and {s}"
+            f"exploration takes a variance (d, d) and a positive scale (d,), got {v.shape} and "
+            f"{s.tolist()}"
+        )
+    if not np.all(np.isfinite(v)) or np.any(np.diag(v) < 0):
+        raise MisstepError(
+            f"exploration takes a variance that is finite and not negative, got {v.tolist()}"
         )
     spread = float(np.mean(np.diag(v) / s**2))
     return 1.0 / (1.0 + spread) if formula == "printed" else spread / (1.0 + spread)
@@ -115,7 +125,7 @@ class DonutMixture:
             )
         else:
             a = self._points(np.array(start)[None])[0]
-        compiled.ascend(a, self._log_h, means, whiteners, lowers, log_norms, self.shape)
+        compiled.ascend(a, self._log_h, means, whiteners, log_norms, self.shape)
         return a
 
     def _points(self, a: ArrayLike) -> Array:

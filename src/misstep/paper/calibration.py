@@ -48,11 +48,22 @@ FIRST = Calibration(
 SECOND = Calibration(
     name="B",
     how=(
-        "The best of 4,000 candidates of a random search over physics and demonstrator "
+        "The best of 2,400 candidates of a random search over physics and demonstrator "
         "(studies/calibrate_paper.py), at another control rate and with a force limit."
     ),
-    system={},
-    demonstrator={},
+    system={
+        "cart_mass": 0.93,
+        "pole_mass": 1.16,
+        "half_length": 0.293,
+        "hinge_damping": 0.134,
+        "cart_damping": 1.2,
+        "rail": 7.18,
+        "force_limit": 100.0,
+        "control_rate": 50.0,
+        "start_spread": 0.074,
+        "stop_at_fall": False,
+    },
+    demonstrator={"gain": 40.0, "noise": 1.5, "hold": 0.229},
 )
 
 CALIBRATIONS = {calibration.name: calibration for calibration in (FIRST, SECOND)}

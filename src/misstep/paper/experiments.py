@@ -25,7 +25,11 @@ DEMONSTRATIONS = 4
 EXPLORATIONS = 11
 
 # s of the exploration formula, N, and the most components that the paper's figures show.
-PAPER_DONUT: Mapping[str, ParameterValue] = {"scale": 10.0, "max_components": 3}
+PAPER_DONUT: Mapping[str, ParameterValue] = {
+    "scale": 10.0,
+    "max_components": 3,
+    "climb": "density",
+}
 PAPER_MEAN: Mapping[str, ParameterValue] = {"max_components": 3}
 
 
@@ -78,6 +82,13 @@ VARIANTS = {
             {**PAPER_DONUT, "climb": "global"},
         ),
         Variant(
+            "log-density",
+            "donut, climbing the log density",
+            "donut",
+            ANGLE,
+            {**PAPER_DONUT, "climb": "warm"},
+        ),
+        Variant(
             "one-component",
             "donut, one Gaussian",
             "donut",
@@ -105,6 +116,14 @@ VARIANTS = {
             "donut-cost",
             ANGLE,
             PAPER_DONUT,
+            "B",
+        ),
+        Variant(
+            "B-log-density",
+            "donut, climbing the log density, physics B",
+            "donut",
+            ANGLE,
+            {**PAPER_DONUT, "climb": "warm"},
             "B",
         ),
         Variant("B-velocity", "donut on (ẋ, θ), physics B", "donut", VELOCITY, PAPER_DONUT, "B"),

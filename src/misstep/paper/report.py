@@ -49,7 +49,10 @@ def render(
         claims=claims,
         verdicts=Counter(claim.verdict for claim in claims).most_common(),
         figure=lambda name: _data_url(figures / f"{name}.png"),
-        videos=[(_data_url(video.path), video.caption) for video in videos],
+        videos=[
+            (_data_url(v.path), f"{v.title}: {v.trajectory.mean_cost:.0f}° over 30 s")
+            for v in videos
+        ],
         calibrations=CALIBRATIONS,
         synthetic=synthetic,
         headline={

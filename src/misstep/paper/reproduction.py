@@ -15,12 +15,16 @@ import multiprocessing
 import os
 import shutil
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
 from misstep.paper import figures, report, tables
@@ -28,11 +32,13 @@ from misstep.paper.claims import Sample, judge_all
 from misstep.paper.experiments import VARIANTS, Variant, run_cell
 from misstep.paper.measures import CellMeasures, measure
 from misstep.paper.results import SHOWN_RUNS, Results, collect_calibration
-from misstep.paper.synthetic import measure_synthetic, run_synthetic
-from misstep.paper.videos import write_videos
+from misstep.paper.synthetic import SyntheticMeasures, run_synthetic, synthetic_measures
+from misstep.paper.videos import VIDEOS, Video, choose_videos, write_video_once
 from misstep.runs import load_run, make_folder, read_json
 from misstep.storage import write_json, write_text
 from misstep.version import __version__, command_line
+
+Array = NDArray[np.float64]
 
 CONFIG = "reproduce.json"
 SEEDS = 30
@@ -54,6 +60,11 @@ class ReproductionConfig:
     def variants(self) -> dict[str, Variant]:
         """The variants to run: all, or with `quick` those that the paper itself shows."""
         return {name: v for name, v in VARIANTS.items() if v.core or not self.quick}
+
+    @property
+    def cells(self) -> list[tuple[str, int]]:
+        """Every variant with every repetition."""
+        return [(name, index) for name in self.variants for index in range(self.seeds)]
 
     @property
     def command(self) -> str:
@@ -129,31 +140,80 @@ def resume(out: Path, *, workers: int | None = None, progress: Progress | None =
 
 
 def _run(out: Path, config: ReproductionConfig, workers: int, progress: Progress) -> Path:
-    cells = [(name, index) for name in config.variants for index in range(config.seeds)]
-    missing = [cell for cell in cells if not _cell_file(out, *cell).exists()]
-    artefacts = figures.FIGURES
-    total = len(cells) + len(artefacts) + 2
-    done = len(cells) - len(missing)
+    missing = [cell for cell in config.cells if not _cell_file(out, *cell).exists()]
+    tally = _Tally(progress, total=len(config.cells) + len(figures.FIGURES) + VIDEOS + 1)
+    tally.done = len(config.cells) - len(missing)
+    with _pool(workers) as pool:
+        calibrations, synthetic = _measure_apart(config, pool)
+        run = partial(_run_and_measure, out, config)
+        for name, index in missing:
+            tally.expect(pool.submit(run, name, index), f"{VARIANTS[name].title}, seed {index + 1}")
+        tally.wait()
+        results = _gather(out, config, calibrations.result(), synthetic.result())
+        make_folder(out / "figures")
+        make_folder(out / "videos")
+        # Videos take longest, so they go first.
+        videos = choose_videos(out / "videos", results)
+        for video in videos:
+            tally.expect(pool.submit(write_video_once, video), video.title)
+        for name in figures.FIGURES:
+            tally.expect(pool.submit(figures.draw, name, out / "figures", results), name)
+        tally.wait()
+    _write_results(out, config, results, videos)
+    tally.count("report")
+    return out / "report.html"
+
+
+class _Tally:
+    """Waits for work in progress and reports each piece as it is done."""
+
+    def __init__(self, progress: Progress, total: int) -> None:
+        self.done = 0
+        self._progress = progress
+        self._total = total
+        self._expected: dict[Future[None], str] = {}
+
+    def expect(self, future: Future[None], what: str) -> None:
+        self._expected[future] = what
+
+    def wait(self) -> None:
+        """Wait for all that is expected; the first error ends it."""
+        for future in as_completed(self._expected):
+            future.result()
+            self.count(self._expected[future])
+        self._expected.clear()
+
+    def count(self, what: str) -> None:
+        self.done += 1
+        self._progress(self.done, self._total, what)
+
+
+@contextmanager
+def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """Open processes that end with this one and drop what is waiting after an error."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, context, initializer=_end_with_parent) as pool:
-        job = partial(_run_and_measure, out, config)
-        for future, (name, index) in _completed(pool, job, missing):
-            future.result()
-            done += 1
-            progress(done, total, f"{config.variants[name].title}, seed {index + 1}")
-        results = _gather(out, config)
-        samples = _samples(results)
-        claims = judge_all(samples)
-        make_folder(out / "figures")
-        drawn = {
-            pool.submit(figures.draw, name, out / "figures", results): name for name in artefacts
-        }
-        for future in as_completed(drawn):
-            future.result()
-            done += 1
-            progress(done, total, f"figure {drawn[future]}")
-        videos = write_videos(out / "videos", results, pool)
-        progress(done + 1, total, "videos")
+        try:
+            yield pool
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _measure_apart(
+    config: ReproductionConfig, pool: ProcessPoolExecutor
+) -> tuple[Future[dict[str, Array]], Future[list[SyntheticMeasures]]]:
+    """Start what needs no run: the calibration's demonstrations, and the synthetic data."""
+    return (
+        pool.submit(collect_calibration, config.seed, quick=config.quick),
+        pool.submit(synthetic_measures, config.seed, config.seeds),
+    )
+
+
+def _write_results(
+    out: Path, config: ReproductionConfig, results: Results, videos: Sequence[Video]
+) -> None:
+    claims = judge_all(_samples(results))
     document = {
         "version": config.version,
         "command": config.command,
@@ -166,16 +226,6 @@ def _run(out: Path, config: ReproductionConfig, workers: int, progress: Progress
     page = report.render(document, claims, results, out / "figures", videos)
     write_text(out / "report.html", page)
     shutil.rmtree(out / "work", ignore_errors=True)
-    progress(total, total, "report")
-    return out / "report.html"
-
-
-def _completed(
-    pool: ProcessPoolExecutor, job: Callable[[str, int], None], cells: Iterable[tuple[str, int]]
-) -> Iterable[tuple[Future[None], tuple[str, int]]]:
-    futures = {pool.submit(job, *cell): cell for cell in cells}
-    for future in as_completed(futures):
-        yield future, futures[future]
 
 
 def _run_and_measure(out: Path, config: ReproductionConfig, name: str, index: int) -> None:
@@ -194,7 +244,12 @@ def _cell_file(out: Path, name: str, index: int) -> Path:
     return out / "cells" / name / f"{index:03d}.json"
 
 
-def _gather(out: Path, config: ReproductionConfig) -> Results:
+def _gather(
+    out: Path,
+    config: ReproductionConfig,
+    calibrations: dict[str, Array],
+    synthetic: list[SyntheticMeasures],
+) -> Results:
     return Results(
         seed=config.seed,
         seeds=config.seeds,
@@ -207,10 +262,8 @@ def _gather(out: Path, config: ReproductionConfig) -> Results:
         },
         runs={name: load_run(out / "runs" / name) for name in SHOWN_RUNS},
         synthetic=run_synthetic(config.seed),
-        synthetic_measures=[
-            measure_synthetic(run_synthetic(config.seed + index)) for index in range(config.seeds)
-        ],
-        calibrations=collect_calibration(config.seed, quick=config.quick),
+        synthetic_measures=synthetic,
+        calibrations=calibrations,
     )
 
 

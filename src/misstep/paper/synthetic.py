@@ -33,6 +33,7 @@ TASK = Task(
     action_low=np.array([-1e3]),
     action_high=np.array([1e3]),
     state=("theta",),
+    dt=1.0,
 )
 LEARNER = DonutLearner(scale=SCALE, max_components=6)
 
@@ -119,6 +120,11 @@ def measure_synthetic(run: SyntheticRun) -> SyntheticMeasures:
         ),
         roughness=(_roughness(second), _roughness(run.explorations[-1].actions[:, 0])),
     )
+
+
+def synthetic_measures(seed: int, seeds: int) -> list[SyntheticMeasures]:
+    """Measure the synthetic runs of the seeds from `seed` on."""
+    return [measure_synthetic(run_synthetic(seed + index)) for index in range(seeds)]
 
 
 def _modes_reached(donut: DonutMixture) -> int:

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from misstep.costs import StateCost
 from misstep.errors import MisstepError
 from misstep.parameters import ParameterValue, build_parameters, check_parameters, parameter
 from misstep.systems.system import System
@@ -43,7 +44,7 @@ class CartPoleParameters:
     )
     cart_damping: float = parameter(0.1, "N·s/m", "viscous friction on the rail", at_least=0)
     gravity: float = parameter(9.81, "m/s²", "downward acceleration", at_least=0)
-    rail: float = parameter(10.0, "m", "from the middle of the rail to each stop", above=0)
+    rail: float = parameter(1000.0, "m", "from the middle of the rail to each stop", above=0)
     force_limit: float = parameter(
         20.0, "N", "largest force on the cart, to either side", above=0, at_most=1e6
     )
@@ -146,7 +147,8 @@ class CartPole(System):
         ``hinge_damping``           0.002    N·m·s/rad  viscous friction in the hinge
         ``cart_damping``            0.1      N·s/m      viscous friction on the rail
         ``gravity``                 9.81     m/s²       downward acceleration
-        ``rail``                    10.0     m          from the middle to each stop
+        ``rail``                    1000.0   m          from the middle to each stop; so long by
+                                                        default that it never matters
         ``force_limit``             20.0     N          largest force, to either side
         ``control_rate``            50.0     Hz         actions per second
         ``physics_step``            0.01     s          longest step of the simulation; the
@@ -207,6 +209,9 @@ class CartPole(System):
         limit = p.force_limit
         self.action_space = gymnasium.spaces.Box(-limit, limit, shape=(1,), dtype=np.float64)
 
+        # Upright and near the middle; weights in 1/m², s²/m², 1, s².
+        limits = (p.rail, math.inf, math.inf, math.inf)
+        self.cost = StateCost((0.0, 0.0, 0.0, 0.0), (0.5, 0.05, 10.0, 0.1), limits)
         self._force_limit = limit
         self._fall_angle = math.radians(p.fall_angle_deg)
         self._stop_at_fall = p.stop_at_fall

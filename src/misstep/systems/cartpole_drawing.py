@@ -107,6 +107,8 @@ class CartPoleScene(_CartPoleView):
             mujoco.mjtGeom.mjGEOM_CYLINDER,
         )
         u, reach = self.unit, self.stop_centre()
+        # How near and far is drawn follows from the extent, which a long rail must not blow up.
+        spec.stat.extent = 6.0 * u
         world, cart, pole = spec.worldbody, spec.body("cart"), spec.body("pole")
         rail_z = RAIL_HEIGHT * u
         world.add_geom(

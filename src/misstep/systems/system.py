@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from misstep.costs import StateCost
 from misstep.parameters import ParameterValue
 from misstep.trajectory import Column
 
@@ -37,6 +38,8 @@ class System(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     action_columns : tuple of Column, length m
     parameters : dict
         Every parameter of the constructor: enough to build the same system again.
+    cost : StateCost or None
+        Cost of an observation as a function, for learners that plan.
     """
 
     system_id: ClassVar[str]
@@ -45,3 +48,4 @@ class System(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     observation_columns: tuple[Column, ...]
     action_columns: tuple[Column, ...]
     parameters: dict[str, ParameterValue]
+    cost: StateCost | None = None
