@@ -258,7 +258,7 @@ NOWHERE = ("--out", "D.h5/sub/x.h5")  # below a file: even the administrator can
         ((*LEARN, "--from", "gone.h5"), ["gone.h5"]),
         (
             (*LEARN, "--from", "D.h5", "--learner", "oracle"),
-            ["'oracle'", "donut, donut-cost, mean"],
+            ["'oracle'", "donut, donut-cost", "mean"],
         ),
         ((*LEARN, "--from", "D.h5", "--state", "theta,tilt"), ["theta,tilt", "x, x_dot, theta"]),
         ((*LEARN, "--from", "D.h5", "--max-trials", "0"), ["max_trials is 0"]),

@@ -104,16 +104,6 @@ def test_unwritable_places_are_told_in_one_line(tmp_path):
     assert os.listdir(tmp_path) == ["file"]
 
 
-@pytest.mark.skipif(
-    not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere"
-)
-def test_a_folder_without_permission_is_told_in_one_line(tmp_path):
-    tmp_path.chmod(0o500)
-    with pytest.raises(MisstepError, match="Permission denied"):
-        write_text(tmp_path / "a.txt", "x")
-    tmp_path.chmod(0o700)
-
-
 def test_a_writer_that_makes_no_file_is_told(tmp_path):
     with pytest.raises(MisstepError, match="No such file"):
         atomic_write(tmp_path / "a.txt", lambda temporary: None)

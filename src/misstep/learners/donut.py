@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from misstep.errors import MisstepError
-from misstep.learners.learner import LEARNERS, Evidence, Task
+from misstep.learners.learner import LEARNERS, Evidence, Task, joint_samples
 from misstep.learners.mixtures import (
     MixtureParameters,
     MixturePolicy,
-    joint_samples,
     restore_mixture,
 )
 from misstep.mixture import DonutMixture, GaussianMixture, compiled, exploration_from_variance

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
 from misstep.learners.donut import DonutParameters, DonutPolicy
-from misstep.learners.learner import LEARNERS, Evidence, Task
-from misstep.learners.mixtures import joint_samples
+from misstep.learners.learner import LEARNERS, Evidence, Task, joint_samples
 from misstep.mixture import GaussianMixture
 from misstep.parameters import parameter
 from misstep.trajectory import Trajectory

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
-from misstep.learners.learner import LEARNERS, Evidence, Task
+from misstep.learners.learner import LEARNERS, Evidence, Task, joint_samples
 from misstep.learners.linear import LinearPolicy
 from misstep.parameters import check_parameters, parameter
 from misstep.trajectory import Trajectory
@@ -85,8 +85,7 @@ class Fall:
             )
         cut = [_until_failure(t) for t in evidence.attempts]
         origin = np.mean([t.select(task.state)[0] for t in cut], axis=0)
-        spread = np.concatenate([t.select(task.state)[:-1] for t in cut]).std(axis=0)
-        _refuse_constant(task, spread)
+        spread = joint_samples(task, cut)[:, : len(task.state)].std(axis=0)
         weights = rng.exponential(size=len(cut)) if evidence.trials else np.ones(len(cut))
         centre, half = _limits(task)
         attempts = [
@@ -173,12 +172,6 @@ def _until_failure(trajectory: Trajectory) -> Trajectory:
 def _limits(task: Task) -> tuple[Array, Array]:
     """Return the middle of the action's range and half of its width, each shape (m,)."""
     return 0.5 * (task.action_low + task.action_high), 0.5 * (task.action_high - task.action_low)
-
-
-def _refuse_constant(task: Task, spread: Array) -> None:
-    for name, value in zip(task.state, spread, strict=True):
-        if value == 0:
-            raise MisstepError(f"column {name} never varies in the attempts: leave it out")
 
 
 def _with_one(x: Array) -> Array:

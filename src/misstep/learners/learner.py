@@ -141,6 +141,25 @@ class Learner(Protocol):
         """Return the policy that `LearnedPolicy.arrays` described."""
 
 
+def joint_samples(task: Task, attempts: Sequence[Trajectory]) -> Array:
+    """Return the (state, action) pairs of all attempts, shape (N, n + m).
+
+    Raises
+    ------
+    MisstepError
+        If a column never varies: then there is nothing to learn from it.
+    """
+    samples = np.concatenate([task.joint(t) for t in attempts])
+    names = [*task.state, *(column.name for column in task.action_columns)]
+    for name, column in zip(names, samples.T, strict=True):
+        if np.all(column == column[0]):
+            raise MisstepError(
+                f"column {name} is constant ({column[0]:g}) in all attempts: leave it out of the "
+                f"state, or record attempts in which it varies"
+            )
+    return samples
+
+
 LEARNERS: Registry[type[Learner]] = Registry("learner", "misstep.learners")
 
 

@@ -7,11 +7,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from misstep.learners.learner import LEARNERS, Evidence, Task
+from misstep.learners.learner import LEARNERS, Evidence, Task, joint_samples
 from misstep.learners.mixtures import (
     MixtureParameters,
     MixturePolicy,
-    joint_samples,
     restore_mixture,
 )
 from misstep.parameters import check_parameters

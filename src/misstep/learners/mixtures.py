@@ -1,6 +1,6 @@
 """What the mixture learners share: fitting the (state, action) pairs, and keeping the result."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,25 +38,6 @@ class MixtureParameters:
             tol=1e-4,
             random_state=rng,
         ).fit(samples, sample_weight=sample_weight)
-
-
-def joint_samples(task: Task, attempts: Sequence[object]) -> Array:
-    """Return the (state, action) pairs of all attempts, shape (N, n + m).
-
-    Raises
-    ------
-    MisstepError
-        If a column never varies: then there is nothing to learn from it.
-    """
-    samples = np.concatenate([task.joint(t) for t in attempts])  # type: ignore[arg-type]
-    names = [*task.state, *(column.name for column in task.action_columns)]
-    for name, column in zip(names, samples.T, strict=True):
-        if np.all(column == column[0]):
-            raise MisstepError(
-                f"column {name} is constant ({column[0]:g}) in all attempts: leave it out of the "
-                f"state, or record attempts in which it varies"
-            )
-    return samples
 
 
 class MixturePolicy:
