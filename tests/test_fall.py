@@ -12,8 +12,10 @@ from misstep.learners.fall import (
     TIME_SCALES,
     Danger,
     Scaled,
-    cautious_control,
+    cascade,
     learn_danger,
+    respond,
+    ways_to_fail,
 )
 
 STATE = ("theta", "theta_dot")
@@ -75,16 +77,53 @@ def test_attempts_that_did_not_fail_say_nothing_of_the_danger():
     rng = np.random.default_rng(0)
     failures = [unstable(rng) for _ in range(3)]
     with_more = [*failures, unstable(rng, failed=False)]
-    np.testing.assert_array_equal(
-        learn_danger(failures, DT).coefficients, learn_danger(with_more, DT).coefficients
-    )
+    grouped = ways_to_fail(with_more, n_demonstrations=4)
+    assert len(grouped) == 1
+    assert [id(a) for a in grouped[0]] == [id(a) for a in failures]
+
+
+def test_ways_to_fail_are_the_lines_along_which_attempts_ended():
+    rng = np.random.default_rng(3)
+
+    def ending_in(x):
+        return Scaled(np.array([[0.0, 0.0], x]), np.zeros((1, 1)), True, 1.0)
+
+    falls = [ending_in([s, 0.1 * rng.normal()]) for s in (1.0, -1.2, 0.9)]
+    rails = [ending_in([0.1 * rng.normal(), s]) for s in (3.0, -2.5)]
+    grouped = ways_to_fail([*falls, *rails], n_demonstrations=3)
+    assert [[id(a) for a in way] for way in grouped] == [
+        [id(a) for a in falls],
+        [id(a) for a in rails],
+    ]
+
+
+def test_the_slow_danger_is_commanded_through_the_fast_one():
+    # p' = 2 p + 3 a falls fast; q' = p drifts, and no action reaches it but through p.
+    rng = np.random.default_rng(4)
+    attempts = []
+    for _ in range(20):
+        x, a = [np.array([0.02, 0.3]) * rng.normal(size=2)], []
+        while len(a) < 200 and abs(x[-1][0]) < 1.0:
+            a.append([rng.uniform(-1, 1)])
+            p, q = x[-1]
+            x.append(np.array([p + DT * (2.0 * p + 3.0 * a[-1][0]), q + DT * 2.0 * p]))
+        attempts.append(Scaled(np.array(x), np.array(a), True, 1.0))
+    fast = Danger(np.array([0.0, 1.0, 0.0]), 0.2, 1.0)
+    slow = Danger(np.array([0.0, 0.4, 1.0]), 1.0, 1.0)
+    alone, both = cascade(attempts, [fast], 0.06, DT), cascade(attempts, [fast, slow], 0.06, DT)
+    for rows, steady in ((alone, False), (both, True)):
+        p, q = 0.0, 0.5
+        for _ in range(1500):
+            action = np.clip(rows[0] @ [1.0, p, q], -1, 1)
+            p, q = p + DT * (2.0 * p + 3.0 * action), q + DT * 2.0 * p
+        assert (abs(p) < 0.1 and abs(q) < 0.1) == steady
 
 
 def test_the_control_minimises_the_expected_square():
     rng = np.random.default_rng(1)
     attempts = [unstable(rng) for _ in range(4)]
     danger = Danger(np.array([0.1, 1.0, 0.4]), 0.2, 1.0)
-    bias, gain = cautious_control(attempts, danger, horizon=3)
+    response = respond(attempts, [a.a for a in attempts], danger, horizon=3)
     # The posterior of the coefficients, from its definition, one window at a time.
     X, y, w = [], [], []
     for attempt in attempts:
@@ -103,7 +142,7 @@ def test_the_control_minimises_the_expected_square():
         best = minimize(
             lambda a, f=features: f(a[0]) @ second @ f(a[0]), [0.0], method="BFGS", tol=1e-12
         )
-        assert bias[0] + gain[0] @ state == pytest.approx(best.x[0], abs=1e-5)
+        assert response.gain[0] @ [1.0, *state] == pytest.approx(best.x[0], abs=1e-5)
 
 
 def test_several_actions_each_get_a_gain():
@@ -113,9 +152,8 @@ def test_several_actions_each_get_a_gain():
         one = unstable(rng)
         idle = rng.uniform(-1, 1, size=(len(one.a), 1))
         attempts.append(one._replace(a=np.hstack([one.a, idle])))
-    bias, gain = cautious_control(attempts, learn_danger(attempts, DT), horizon=3)
-    assert bias.shape == (2,)
-    assert gain.shape == (2, 2)
+    gain = cascade(attempts, [learn_danger(attempts, DT)], 0.06, DT)
+    assert gain.shape == (2, 3)
     # The second action does nothing, so hardly anything is asked of it.
     assert np.abs(gain[1]).max() < 0.2 * np.abs(gain[0]).max()
 
