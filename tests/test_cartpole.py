@@ -10,9 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+from misstep import Outcome, demonstrate, rollout
 from misstep.errors import MisstepError
-from misstep.systems import CartPole, CartPoleParameters, list_systems, make_system
+from misstep.systems import CartPole, list_systems, make_system
 from misstep.systems.cartpole import wrap_angle
+from misstep.systems.rendering import frames
 
 LONG = {"stop_at_fall": False, "duration": 1000.0}
 FRICTIONLESS = {"hinge_damping": 0.0, "cart_damping": 0.0}
@@ -59,10 +61,12 @@ def drive(system, forces):
 @pytest.mark.filterwarnings("ignore:.*A Box observation space (min|max)imum value is -?infinity")
 @pytest.mark.parametrize("render_mode", [None, "rgb_array"])
 @pytest.mark.parametrize("parameters", [{}, {"angle_noise": 0.01, "delay": 0.03}])
-def test_passes_gymnasium_checks(render_mode, parameters):
-    env = gymnasium.make("misstep/CartPole-v1", render_mode=render_mode, **parameters)
+@pytest.mark.parametrize("name", ["CartPole", "CartPoleRail", "CartPoleSwingUp"])
+def test_passes_gymnasium_checks(name, render_mode, parameters):
+    env = gymnasium.make(f"misstep/{name}-v1", render_mode=render_mode, **parameters)
     check_env(env.unwrapped, skip_render_check=render_mode is None)
-    assert env.unwrapped.parameters == {**asdict(CartPoleParameters()), **parameters}
+    defaults = asdict(env.unwrapped.parameters_type())
+    assert env.unwrapped.parameters == {**defaults, **parameters}
     env.close()
 
 
@@ -280,6 +284,129 @@ def test_lasting_to_the_end_is_a_success():
     assert [info["success"] for info in infos] == [False] * 49 + [True]
 
 
+@pytest.mark.parametrize("stop_at_fall", [True, False])
+def test_leaving_the_track_is_a_failure(stop_at_fall):
+    system = CartPole(track_limit=0.3, stop_at_fall=stop_at_fall, fall_angle_deg=180.0, duration=2)
+    _, info = system.reset(seed=0)
+    assert not info["failed"]
+    left, over = False, False
+    while not over:
+        observation, _, terminated, truncated, info = system.step(np.array([-3.0]))
+        left = left or observation[0] < -0.3
+        assert info["failed"] == left
+        assert terminated == (left and stop_at_fall)
+        over = terminated or truncated
+    assert left
+    assert not info["success"]
+    assert not info["timed_out"]
+    system.set_state(0.31, 0.0, 0.0, 0.0)
+    assert system.step(np.zeros(1))[4]["failed"]
+
+
+def test_without_a_track_limit_the_cart_may_go_anywhere():
+    system = CartPole(fall_angle_deg=180.0, duration=2.0)
+    system.reset(seed=0)
+    steps = [system.step(np.array([15.0])) for _ in range(100)]
+    assert steps[-1][0][0] > 3.0
+    assert steps[-1][4]["success"]
+
+
+class Proportional:
+    """The linear feedback that keeps the pole upright."""
+
+    def reset(self):
+        pass
+
+    def __call__(self, observation):
+        return np.array([observation @ (1.0, 2.5, 40.0, 10.0)])
+
+
+def test_rail_is_balanced_for_a_minute_on_its_track():
+    system = make_system("cartpole-rail")
+    assert system.parameters["rail"] > system.parameters["track_limit"] == 2.4
+    trajectory = rollout(system, Proportional(), seed=0, demonstrator="test")
+    assert trajectory.outcome is Outcome.SUCCESS
+    assert trajectory.duration == pytest.approx(60.0)
+    assert trajectory.provenance.system == "cartpole-rail"
+    system.reset(seed=0)
+    system.set_state(2.3, 1.0, 0.3, 0.0)
+    failed = [system.step(np.zeros(1))[4]["failed"] for _ in range(6)]
+    assert not failed[0]
+    assert failed[-1], "the track ends after 0.1 s at 1 m/s"
+
+
+def test_swing_up_starts_hanging_and_does_not_fail_by_that():
+    system = make_system("cartpole-swingup", duration=6.0)
+    observation, info = system.reset(seed=0)
+    assert abs(abs(observation[2]) - math.pi) < 0.2
+    assert not info["failed"]
+    steps = [system.step(np.zeros(1)) for _ in range(300)]
+    assert [step[2] for step in steps] == [False] * 300
+    assert [step[4]["failed"] for step in steps] == [False] * 299 + [True]
+    assert [step[4]["timed_out"] for step in steps] == [False] * 299 + [True]
+
+
+@pytest.mark.parametrize("force", [2.0, 5.0, 10.0])
+def test_swing_up_fails_at_the_stops(force):
+    system = make_system("cartpole-swingup")
+    system.reset(seed=0)
+    over = False
+    while not over:
+        observation, _, terminated, truncated, info = system.step(np.array([force]))
+        over = terminated or truncated
+    assert terminated
+    assert info["failed"]
+    assert not info["timed_out"]
+    assert observation[0] == pytest.approx(2.4, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("kick", "success"),
+    [(None, True), (2.0, True), (5.2, False), (9.8, False)],
+)
+def test_swing_up_is_upright_during_the_whole_last_five_seconds(kick, success):
+    system = make_system("cartpole-swingup")
+    system.reset(seed=0)
+    system.set_state(0.0, 0.0, 0.02, 0.0)
+    hold = Proportional()
+    angles = [0.02]
+    for step in range(500):
+        kicked = kick is not None and 0 <= step - round(50 * kick) < 6  # brings it to some 13°
+        action = np.array([-10.0]) if kicked else hold(system.state)
+        observation, _, _, _, info = system.step(action)
+        angles.append(observation[2])
+    upright = np.abs(angles) < math.radians(12.0)
+    assert (kick is None) == upright.all()
+    assert upright[-251:].all() == success
+    assert (info["success"], info["failed"]) == (success, not success)
+
+
+@pytest.mark.parametrize("name", ["cartpole-rail", "cartpole-swingup"])
+def test_variants_are_cart_poles_with_other_defaults(name):
+    system = make_system(name, pole_mass=0.2)
+    same = make_system("cartpole", **system.parameters)
+    assert same.parameters == system.parameters
+    assert system.system_id == name
+    assert system.cost.limits[0] == 2.4
+    for one in (system, same):
+        one.set_state(0.0, 0.0, 0.1, 0.0)
+    np.testing.assert_array_equal(drive(system, [1.0] * 10), drive(same, [1.0] * 10))
+    rows = {row.name: row for row in list_systems()[name]}
+    for row in list_systems()["cartpole"]:
+        mine = rows[row.name]
+        assert (mine.unit, mine.meaning) == (row.unit, row.meaning)
+        if mine.default != row.default:
+            line = next(n for n in type(system).__doc__.splitlines() if f"``{row.name}``  " in n)
+            assert line.split()[1] in (str(mine.default), "π")
+
+
+def test_variants_are_drawn():
+    for name in ("cartpole-rail", "cartpole-swingup"):
+        trajectory = demonstrate(make_system(name, failure="abs(x) > 1m"), "random", n=1)[0]
+        pictures = list(frames(trajectory, fps=2, width=320, height=180))
+        assert len({picture.tobytes() for picture in pictures}) == len(pictures)
+
+
 def test_parameters_rebuild_the_system():
     first = CartPole(pole_mass=0.3, duration=5, stop_at_fall=False, delay=0.02)
     again = make_system("cartpole", **first.parameters)
@@ -316,6 +443,8 @@ def test_lists_every_parameter_with_unit_and_documents_it():
         ({"stop_at_fall": 1}, "stop_at_fall is 1 but must be true or false"),
         ({"duration": 0.001}, "duration is 0.001 s, shorter than one control period of 0.02 s"),
         ({"hinge_damping": 50.0}, "physics_step is 0.01 s, too long .* at most"),
+        ({"track_limit": -1.0}, "track_limit is -1 m but must be at least 0 m"),
+        ({"upright_time": 31.0}, "upright_time is 31 s but must be at most the duration, 30 s"),
         ({"render_mode": "human"}, "render_mode is 'human'; there is: 'rgb_array'"),
     ],
 )
@@ -323,6 +452,11 @@ def test_wrong_parameters_are_told_in_one_line(parameters, line):
     with pytest.raises(MisstepError, match=line) as caught:
         make_system("cartpole", **parameters)
     assert "\n" not in str(caught.value)
+
+
+def test_a_wrong_parameter_of_a_variant_names_the_variant(refused):
+    with refused("cartpole-swingup: duration is 0 s but must be greater than 0 s"):
+        make_system("cartpole-swingup", duration=0)
 
 
 def test_unknown_system_lists_the_known():

@@ -111,7 +111,7 @@ def test_version(capsys):
 
 
 @pytest.mark.parametrize(
-    "command", ["demonstrate", "learn", "resume", "evaluate", "reproduce", "list"]
+    "command", ["demonstrate", "learn", "resume", "evaluate", "reproduce", "study", "list"]
 )
 def test_help_has_an_example(capsys, command):
     assert main([command, "--help"]) == 0
@@ -141,6 +141,36 @@ def test_demonstrate(here, capsys):
     assert result["parameters"]["demonstrator"]["noise"] == 8.0
     table = capsys.readouterr().out
     assert all(f"{t.duration:.2f}" in table for t in expected)
+
+
+JUDGES = ("--success", "abs(theta) < 15deg", "--failure", "x > 30cm", "--cost", "abs(theta)")
+
+
+def test_judges_go_with_the_demonstrations(here):
+    words = ("demonstrate", "cartpole", "--by", "random", *JUDGES, "--set", "hold=1")
+    assert main([*words, "--set", "duration=4", "--out", "J.h5"]) == 0
+    told = {"success": "abs(theta) < 15deg", "failure": "x > 30cm", "cost": "abs(theta)"}
+    for attempt in misstep.load_dataset("J.h5"):
+        parameters = attempt.provenance.parameters
+        assert {name: parameters[name] for name in told} == told
+        assert parameters["hold"] == 1.0
+        np.testing.assert_allclose(attempt.costs, np.abs(attempt.column("theta")[1:]))
+        assert (attempt.column("x")[:-1] <= 0.3).all()
+    words = ("learn", "cartpole", "--from", "J.h5", "--learner", "mean", "--max-trials", "1")
+    assert main([*words, "--failure", "x > 1cm", "--keep-going", "--out", "RUN"]) == 0
+    parameters = misstep.load_run("RUN").config.system_parameters
+    assert (parameters["success"], parameters["failure"]) == (told["success"], "x > 1cm")
+    assert main(["evaluate", "RUN", "--episodes", "2"]) == 0
+
+
+def test_a_gymnasium_environment_by_its_id(here):
+    words = ("demonstrate", "gym:InvertedPendulum-v5", "--by", "random", "--set", "duration=1")
+    assert main([*words, "--out", "G.h5"]) == 0
+    words = ("learn", "gym:InvertedPendulum-v5", "--from", "G.h5", "--learner", "mean")
+    assert main([*words, "--max-trials", "1", "--keep-going"]) == 0
+    run = misstep.load_run("runs/gym-InvertedPendulum-v5-mean-0")
+    assert run.config.system_parameters["failure"] == "abs(theta) > 0.2rad"
+    assert run.config.system_parameters["duration"] == 1.0
 
 
 def test_demonstrate_replaces_a_file_only_when_forced(here, capsys):
@@ -208,6 +238,7 @@ def test_evaluate(here, finished, capsys):
     ("what", "named"),
     [
         ("systems", ["cartpole", "pole_mass", "0.1", "kg", "uniform thin rod"]),
+        ("systems", ["cartpole-rail: Keep a pole", "cartpole-swingup: Swing", "gym:ID: A Gym"]),
         ("learners", ["donut-cost", "Rung 3", "reach", "prose"]),
         ("demonstrators", ["bang-bang", "reaction_max", "deg"]),
         ("formats", ["hdf5", ".h5"]),
@@ -218,9 +249,9 @@ def test_list(here, capsys, what, named):
     text = capsys.readouterr().out
     for word in named:
         assert word in text
-    assert set(json.loads(Path("list.json").read_text())[what]) == set(
-        getattr(misstep, what.upper())
-    )
+    listed = set(json.loads(Path("list.json").read_text())[what])
+    assert listed - {"gym:ID"} == set(getattr(misstep, what.upper()))
+    assert ("gym:ID" in listed) == (what == "systems")
 
 
 # Bad input
@@ -232,13 +263,28 @@ NOWHERE = ("--out", "D.h5/sub/x.h5")  # below a file: even the administrator can
     ("words", "told"),
     [
         ((), ["command", "--help"]),
-        (("dance",), ["'dance'", "demonstrate, learn, resume, evaluate, reproduce, list"]),
+        (("dance",), ["'dance'", "demonstrate, learn, resume, evaluate, reproduce, study, list"]),
         (("learn", "--speed", "3"), ["--speed", "--learner, --state, --max-trials"]),
         (("learn",), ["SYSTEM", "misstep learn --help"]),
         (("learn", "cartpole", "--from"), ["--from", "argument"]),
         (("learn", "cartpole", "--from", "D.h5", "--seed", "x"), ["--seed", "integer"]),
         (("list", "things"), ["'things'", "systems, learners, demonstrators, formats"]),
         (("demonstrate", "unicycle", "--out", "N.h5"), ["'unicycle'", "cartpole"]),
+        (
+            ("demonstrate", "cartpole", "--failure", "abs(theta > 1", "--out", "N.h5"),
+            ["cartpole, failure, character 14", "')' is missing"],
+        ),
+        (
+            ("demonstrate", "cartpole", "--cost", "tilt", "--out", "N.h5"),
+            ["no column 'tilt'", "x [m], x_dot [m/s], theta [rad]"],
+        ),
+        (
+            ("demonstrate", "cartpole", "--cost", "x", "--set", "cost=x", "--out", "N.h5"),
+            ["--set cost and --cost", "choose one"],
+        ),
+        (("demonstrate", "gym:Nope-v0", "--out", "N.h5"), ["gym:Nope-v0 cannot be made"]),
+        (("demonstrate", "gym:Swimmer-v5", "--out", "N.h5"), ["give success or failure", "o0"]),
+        ((*LEARN, "--from", "D.h5", "--success", "theta"), ["a condition is wanted"]),
         (("demonstrate", "cartpole", "--by", "magic", "--out", "N.h5"), ["'magic'", "weak"]),
         (("demonstrate", "cartpole", "-n", "0", "--out", "N.h5"), ["n is 0", "at least 1"]),
         (("demonstrate", "cartpole", "--seed", "-1", "--out", "N.h5"), ["seed is -1"]),

@@ -5,10 +5,11 @@ import pytest
 
 from misstep.demonstrators import demonstrate, list_demonstrators
 from misstep.errors import MisstepError
-from misstep.systems import CartPole
+from misstep.systems import CartPole, make_system
 from misstep.trajectory import Column, Outcome
 
 KINDS = ["bang-bang", "delayed", "noisy", "random", "reversed", "weak"]
+STRIKING = ["bracket", "lopsided", "strong", "timid"]
 
 
 @pytest.fixture
@@ -30,11 +31,13 @@ def test_every_demonstration_failed(system, kind):
 
 def test_all_kinds_are_listed_with_units():
     table = list_demonstrators()
-    assert sorted(table) == KINDS
+    assert sorted(table) == sorted(KINDS + STRIKING)
     rows = {row.name: row for row in table["noisy"]}
     assert (rows["gain"].default, rows["gain"].unit) == (20.0, "N/rad")
     assert (rows["noise"].default, rows["noise"].unit) == (5.0, "N")
-    assert all(row.unit and row.meaning for rows in table.values() for row in rows)
+    assert all(row.meaning for rows in table.values() for row in rows)
+    unitless = {row.name for rows in table.values() for row in rows if not row.unit}
+    assert unitless == {"far_every"}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -117,7 +120,10 @@ def test_recorded_seed_is_the_systems(system):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ({"by": "clumsy"}, "no demonstrator named 'clumsy'; there are: bang-bang, delayed"),
+        (
+            {"by": "clumsy"},
+            "no demonstrator named 'clumsy'; there are: bang-bang, bracket, delayed",
+        ),
         ({"n": 0}, "n is 0: at least 1"),
         ({"seed": -1}, "seed is -1: it must not be negative"),
         ({"gian": 3.0}, r"demonstrator noisy has no parameter 'gian'; it has: gain \[N/rad\]"),
@@ -136,7 +142,101 @@ def test_who_does_not_fail_is_told():
         demonstrate(short, "noisy", n=1, noise=0.0)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.fixture(scope="module", params=["flipup", "basket"])
+def struck(request):
+    return make_system(request.param)
+
+
+def sides(demonstrations):
+    """Return for each attempt -1 if its outcome is that of too little, 1 of too much."""
+    sides = []
+    for trajectory in demonstrations:
+        assert trajectory.outcome is Outcome.FAILURE
+        assert trajectory.failure_step == trajectory.n_steps
+        if trajectory.provenance.system == "flipup":
+            angle = trajectory.column("block_angle")[-1]
+            assert min(abs(angle), abs(angle - math.pi)) < 0.5
+            sides.append(-1 if angle < math.pi / 2 else 1)
+        else:
+            ball_x = trajectory.column("ball_x")[-1]
+            assert not 0.7 < ball_x < 0.9
+            sides.append(-1 if ball_x < 0.8 else 1)
+    return sides
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        ("timid", [-1] * 12),
+        ("strong", [1] * 12),
+        ("bracket", [-1, 1] * 6),
+        ("lopsided", [-1, -1, -1, 1] * 3),
+    ],
+)
+def test_strikes_fail_in_the_way_their_name_says(struck, kind, expected):
+    demonstrations = demonstrate(struck, kind, n=12, seed=0)
+    assert sides(demonstrations) == expected
+    for trajectory in demonstrations:
+        position, actions = trajectory.column("position"), trajectory.actions
+        assert np.all(np.diff(position[:-1]) >= 0.0)
+        assert np.all(position[:-1] < struck.stroke)
+        assert np.all(actions > struck.parameters["stop_speed"])
+        assert np.all(actions <= struck.parameters["v_max"])
+        assert trajectory.provenance.demonstrator == kind
+
+
+def test_strikes_follow_a_rising_profile_of_the_position(struck):
+    for trajectory in demonstrate(struck, "timid", n=5, seed=1, slowest=0.4, fastest=0.4):
+        share = trajectory.column("position")[:-1] / struck.stroke
+        velocity = trajectory.actions[:, 0] / struck.parameters["v_max"]
+        assert 0.15 * 0.4 * 0.75 < velocity[0] < 0.45 * 0.4 * 1.25  # within 4 tremors
+        plateau = velocity[share > 0.6]
+        assert np.mean(plateau) == pytest.approx(0.4, rel=4 * 0.06 / math.sqrt(len(plateau)))
+
+
+def test_the_halves_of_a_bracket_are_equally_far_from_its_centre(struck):
+    demonstrations = demonstrate(struck, "bracket", n=40, seed=2)
+    tops = np.array([t.actions[-3:].mean() for t in demonstrations]) / struck.parameters["v_max"]
+    slow, fast = tops[::2], tops[1::2]
+    # Tremor averages out but where it is clipped, at 1: that costs less than a hundredth.
+    assert np.mean(slow) + np.mean(fast) == pytest.approx(2 * 0.66, abs=0.03)
+    assert np.all(slow < 0.45)
+    assert np.all(fast > 0.85)
+
+
+@pytest.mark.parametrize("kind", STRIKING)
+def test_same_seed_same_strikes(struck, kind):
+    two, three = (demonstrate(struck, kind, n=n, seed=4) for n in (2, 3))
+    for short, long in zip(two, three, strict=False):
+        np.testing.assert_array_equal(short.observations, long.observations)
+        np.testing.assert_array_equal(short.actions, long.actions)
+    assert not np.array_equal(two[0].actions, two[1].actions)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ({"by": "noisy"}, "noisy does not fit flipup: it must observe theta and take one action; "),
+        ({"by": "noisy"}, "these kinds fit: bracket, lopsided, random, strong, timid$"),
+        ({"by": "timid", "fastest": 0.1}, "timid: slowest is 0.2 v_max, above fastest, 0.1 v_max"),
+        ({"by": "strong", "fastest": 1.1}, "strong: fastest is 1.1 v_max but must be at most 1"),
+        ({"by": "bracket", "nearest": 0.5}, "nearest is 0.5 v_max, above farthest, 0.34 v_max"),
+        ({"by": "bracket", "centre": 0.8}, r"farthest is 0.34 v_max, but centre, 0\.8 v_max, must"),
+        ({"by": "lopsided", "far_every": 0}, "far_every is 0 but must be at least 1"),
+        ({"by": "timid", "n": 1, "slowest": 0.66, "fastest": 0.66}, "timid failed in 0 of 50"),
+    ],
+)
+def test_wrong_strikes_are_told_in_one_line(arguments, line):
+    with pytest.raises(MisstepError, match=line):
+        demonstrate(make_system("flipup"), **arguments)
+
+
+def test_strikes_do_not_fit_a_pole(system):
+    with pytest.raises(MisstepError, match=r"an effector .*; these kinds fit: bang-bang, delayed"):
+        demonstrate(system, "timid")
+
+
+@pytest.mark.parametrize("kind", sorted({*KINDS} - {"random"}))
 def test_a_system_without_theta_is_told(kind):
     class Headless(CartPole):
         observation_columns = (

@@ -346,7 +346,7 @@ def test_parameters_are_checked(refused, name, parameters, message):
 
 
 def test_an_unknown_learner_is_named(refused):
-    with refused("no learner named 'doughnut'; there are: donut"):
+    with refused("no learner named 'doughnut'; there are: balanced-mean, "):
         LEARNERS["doughnut"]
 
 

@@ -7,10 +7,13 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
+from misstep.demonstrators import demonstrate
 from misstep.errors import MisstepError
 from misstep.rollout import rollout
-from misstep.systems import CartPole
+from misstep.systems import CartPole, make_system
+from misstep.systems.basket_drawing import BasketScene, BasketSketch
 from misstep.systems.cartpole_drawing import CartPoleScene, CartPoleSketch
+from misstep.systems.flipup_drawing import FlipUpScene, FlipUpSketch
 from misstep.systems.offscreen import NoOpenGLError
 from misstep.systems.rendering import Painter, frames, n_frames, write_video
 from misstep.trajectory import Column, Provenance, Trajectory
@@ -113,6 +116,80 @@ def test_environment_renders_what_it_simulates():
     assert CartPole().render() is None
 
 
+@pytest.fixture(scope="module", params=["flipup", "basket"])
+def strikes(request):
+    """Return a strike that is too slow and one that is too fast."""
+    return demonstrate(make_system(request.param), "bracket", n=2, seed=0, time="")
+
+
+@pytest.fixture(params=[0, 1], ids=["scene", "sketch"])
+def draw_strike(request, strikes):
+    """Return a function of a trajectory and a step that returns a picture as integers."""
+    kinds = {"flipup": (FlipUpScene, FlipUpSketch), "basket": (BasketScene, BasketSketch)}
+    try:
+        drawing = kinds[strikes[0].provenance.system][request.param]({}, *SIZE)
+    except NoOpenGLError as error:
+        pytest.skip(f"no OpenGL: {error}")
+
+    def draw_step(trajectory, step):
+        names = [column.name for column in trajectory.observation_columns]
+        observation = dict(zip(names, trajectory.observations[step], strict=True))
+        return drawing.draw(observation, {"velocity": 0.0}).astype(int)
+
+    yield draw_step
+    drawing.close()
+
+
+def struck_thing(picture, system):
+    """Return the columns of the pixels of the block (blue) or of the ball (red)."""
+    red, green, blue = np.moveaxis(picture, -1, 0)
+    ours = blue - red > 70 if system == "flipup" else (red - green > 90) & (green - blue < 40)
+    return np.nonzero(ours)[1]
+
+
+def test_what_was_struck_is_drawn_where_it_was_seen(strikes, draw_strike):
+    system = strikes[0].provenance.system
+    start, short, far = (
+        struck_thing(draw_strike(*place), system)
+        for place in ((strikes[0], 0), (strikes[0], -1), (strikes[1], -1))
+    )
+    assert min(map(len, (start, short, far))) > 10
+    if system == "flipup":
+        assert np.mean(short) == pytest.approx(np.mean(start), abs=8)  # it fell back
+        assert np.mean(far) < np.mean(start) - 20  # it tipped over, away from the effector
+    else:
+        assert np.mean(start) < np.mean(short) < np.mean(far)
+        assert far.max() < SIZE[0]  # the picture grows to hold it
+
+
+def test_arrow_of_a_strike_is_there_while_it_moves(strikes, draw_strike):
+    resting, moving = draw_strike(strikes[1], 0), draw_strike(strikes[1], -2)
+    assert len(arrow(moving)) > len(arrow(resting)) > 0
+
+
+def test_strikes_are_shown_slowly_and_their_end_for_a_second(strikes):
+    trajectory = strikes[1]
+    pictures = list(frames(trajectory, fps=20, width=320, height=180))
+    assert len(pictures) == n_frames(trajectory, fps=20) == trajectory.n_steps + 1 + 20
+    for picture in pictures[-20:]:
+        np.testing.assert_array_equal(picture, pictures[-21])
+    assert not np.array_equal(pictures[-22], pictures[-21])
+    upper_right = pictures[-21][38:50, 240:305].astype(int)
+    assert (upper_right[..., 0] - upper_right[..., 1] > 60).any()  # "failure" is written in red
+
+
+def test_struck_systems_render_what_they_simulate(strikes):
+    trajectory = strikes[0]
+    system = make_system(trajectory.provenance.system, render_mode="rgb_array")
+    system.reset(seed=trajectory.provenance.seed)
+    before = system.render()
+    for action in trajectory.actions:
+        system.step(action)
+    assert before.shape == (360, 640, 3)
+    assert np.abs(before.astype(int) - system.render()).max() > 100
+    system.close()
+
+
 def test_title_angle_force_and_time_are_written(trajectory):
     def paint(title="", theta=0.1, force=1.0, time=0.0):
         with Painter("cartpole", {}, width=320, height=180, title=title) as painter:
@@ -132,7 +209,8 @@ def test_frames_show_the_recorded_observations_from_first_to_last(trajectory):
         for k in (0, 7, 15):
             step = 5 * k
             observation = {name: trajectory.column(name)[step] for name in ("x", "theta")}
-            expected = painter.paint(observation, {"force": 3.0}, k / 10)
+            outcome = trajectory.outcome if k == 15 else ""
+            expected = painter.paint(observation, {"force": 3.0}, k / 10, outcome)
             np.testing.assert_array_equal(pictures[k], expected)
 
 

@@ -120,7 +120,9 @@ def resume(run: Run, *, system: System | None = None, on_trial: OnTrial | None =
         stream = np.random.SeedSequence(run.config.seed, spawn_key=(len(run.trials),))
         learning, acting = stream.spawn(2)
         started = time.perf_counter()
-        evidence = Evidence.seen_from(learner.rung, run.demonstrations, run.trials)
+        evidence = Evidence.seen_from(
+            learner.rung, run.demonstrations, run.trials, run.policies, run.config.seed
+        )
         policy = learner.policy(task, evidence, np.random.default_rng(learning))
         seconds = time.perf_counter() - started
         trial = rollout(

@@ -71,6 +71,12 @@ def parameter(
     )
 
 
+def other_default(kind: type, name: str, default: ParameterValue) -> Any:
+    """Declare a field as the dataclass `kind` does, but with another default."""
+    (declared,) = (f for f in fields(kind) if f.name == name)
+    return field(default=default, metadata=declared.metadata)
+
+
 def parameter_table(kind: type) -> list[ParameterRow]:
     """Return the parameters of the dataclass `kind` in the order of their declaration."""
     return [

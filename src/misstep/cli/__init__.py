@@ -9,6 +9,7 @@
     learn.py          learn, resume
     evaluate.py       evaluate
     reproduce.py      reproduce
+    study.py          study
     catalogue.py      list
 
 A command imports what it needs when it runs: ``misstep --help`` must not wait for the physics and

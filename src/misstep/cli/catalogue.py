@@ -33,9 +33,12 @@ def list_(
 
 
 def _systems() -> dict[str, dict[str, Any]]:
-    from misstep import SYSTEMS
+    from misstep.systems import JUDGE_PARAMETERS, SYSTEMS, GymParameters, GymSystem
 
-    return {name: _describe(kind, kind.parameters_type) for name, kind in SYSTEMS.items()}
+    kinds = {name: _describe(kind, kind.parameters_type) for name, kind in SYSTEMS.items()}
+    adapter = _describe(GymSystem, GymParameters)
+    adapter["parameters"] += [row._asdict() for row in JUDGE_PARAMETERS]
+    return {**kinds, "gym:ID": adapter}
 
 
 def _learners() -> dict[str, dict[str, Any]]:

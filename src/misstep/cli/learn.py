@@ -1,5 +1,6 @@
 """``misstep learn`` and ``misstep resume``: trial after trial, until one succeeds."""
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -8,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from misstep.cli.interruption import resumable
-from misstep.cli.options import JsonFile, Seed, SystemName, parse_names, parse_parameters
+from misstep.cli.options import (
+    Cost,
+    Failure,
+    JsonFile,
+    Seed,
+    Success,
+    SystemName,
+    parse_names,
+    parse_parameters,
+    system_parameters,
+)
 from misstep.cli.output import (
     check_output_file,
     print_attempts,
@@ -65,6 +76,9 @@ def learn(
             "--with", metavar="NAME=VALUE", help="A parameter of the learner; repeatable."
         ),
     ] = None,
+    success: Success = None,
+    failure: Failure = None,
+    cost: Cost = None,
     keep_going: Annotated[
         bool, typer.Option("--keep-going", help="Make all trials, whatever comes of them.")
     ] = False,
@@ -78,11 +92,13 @@ def learn(
     import misstep
     from misstep.runs import CONFIG
 
-    given, parameters = parse_parameters("--set", set_), parse_parameters("--with", with_)
+    given = system_parameters(set_, success=success, failure=failure, cost=cost)
+    parameters = parse_parameters("--with", with_)
     misstep.LEARNERS[learner]  # an unknown name is told before anything is read
     shown = misstep.load_dataset(demonstrations)
     driven = misstep.make_system(system, **_system_parameters(system, shown, given))
-    folder = Path("runs") / f"{system}-{learner}-{seed}" if out is None else out
+    name = re.sub(r"[^\w.-]", "-", f"{system}-{learner}-{seed}")  # gym:space/Robot-v1
+    folder = Path("runs") / name if out is None else out
     check_output_file(json, "--json")
     with progress("trial") as report, resumable(folder, CONFIG):
         report(0, max_trials, "")

@@ -13,6 +13,34 @@ from misstep.parameters import ParameterValue
 SystemName = Annotated[
     str, typer.Argument(metavar="SYSTEM", help="A system of `misstep list systems`.")
 ]
+Success = Annotated[
+    str | None,
+    typer.Option(
+        "--success",
+        metavar="EXPR",
+        help='What a success is in the end, in place of the system\'s own: "abs(theta) < 12deg"; '
+        "held for the last T seconds with --set hold=T.",
+        show_default=False,
+    ),
+]
+Failure = Annotated[
+    str | None,
+    typer.Option(
+        "--failure",
+        metavar="EXPR",
+        help='What is a failure too, and ends an attempt: "abs(theta) > 20deg or abs(x) > 1m".',
+        show_default=False,
+    ),
+]
+Cost = Annotated[
+    str | None,
+    typer.Option(
+        "--cost",
+        metavar="EXPR",
+        help='Cost of a step, in place of the system\'s own: "abs(theta) + 0.1 * x * x".',
+        show_default=False,
+    ),
+]
 Seed = Annotated[int, typer.Option(help="Same seed, same result.")]
 JsonFile = Annotated[
     Path | None,
@@ -50,6 +78,26 @@ def parse_parameters(option: str, texts: Sequence[str] | None) -> dict[str, Para
         if name in values:
             raise MisstepError(f"{option} {text!r}: {name} is given twice")
         values[name] = _parse_value(value)
+    return values
+
+
+def system_parameters(
+    set_: Sequence[str] | None, **judges: str | None
+) -> dict[str, ParameterValue]:
+    """Read the texts of ``--set`` and the options that judge, such as ``--success``.
+
+    Raises
+    ------
+    MisstepError
+        As `parse_parameters`; and if a judge is given both ways.
+    """
+    values = parse_parameters("--set", set_)
+    for name, formula in judges.items():
+        if formula is None:
+            continue
+        if name in values:
+            raise MisstepError(f"--set {name} and --{name} are both given: choose one")
+        values[name] = formula
     return values
 
 

@@ -6,7 +6,16 @@ from typing import Annotated, Any
 
 import typer
 
-from misstep.cli.options import JsonFile, Seed, SystemName, parse_parameters
+from misstep.cli.options import (
+    Cost,
+    Failure,
+    JsonFile,
+    Seed,
+    Success,
+    SystemName,
+    parse_parameters,
+    system_parameters,
+)
 from misstep.cli.output import (
     check_output_file,
     print_attempts,
@@ -34,6 +43,9 @@ def demonstrate(
             "--with", metavar="NAME=VALUE", help="A parameter of the demonstrator; repeatable."
         ),
     ] = None,
+    success: Success = None,
+    failure: Failure = None,
+    cost: Cost = None,
     seed: Seed = 0,
     force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
     json: JsonFile = None,
@@ -43,7 +55,8 @@ def demonstrate(
 
     given: dict[str, Any] = parse_parameters("--with", with_)
     kind = build_parameters(misstep.DEMONSTRATORS[by], f"demonstrator {by}", given)
-    driven = misstep.make_system(system, **parse_parameters("--set", set_))
+    judged = system_parameters(set_, success=success, failure=failure, cost=cost)
+    driven = misstep.make_system(system, **judged)
     _check_out(out, force)
     check_output_file(json, "--json")
     with progress("demonstrating"):

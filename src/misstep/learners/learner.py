@@ -18,7 +18,7 @@ rung what the learner is told of an attempt
 ==== ===================================================================
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol, Self
 
@@ -30,7 +30,7 @@ from misstep.errors import MisstepError
 from misstep.registry import Registry
 from misstep.rollout import Policy
 from misstep.systems.system import System
-from misstep.trajectory import Column, Dataset, Outcome, Trajectory
+from misstep.trajectory import Column, Outcome, Trajectory
 
 Array = NDArray[np.float64]
 
@@ -106,13 +106,26 @@ class Evidence:
 
     demonstrations: tuple[Trajectory, ...]
     trials: tuple[Trajectory, ...]
+    policies: tuple["LearnedPolicy", ...] = ()
+    """The learner's own policy of each trial."""
+    seed: int = 0
+    """The same for all trials of a run, for learners that replay their own past."""
 
     @classmethod
-    def seen_from(cls, rung: int, demonstrations: Dataset, trials: Sequence[Trajectory]) -> Self:
+    def seen_from(
+        cls,
+        rung: int,
+        demonstrations: Iterable[Trajectory],
+        trials: Iterable[Trajectory],
+        policies: Iterable["LearnedPolicy"] = (),
+        seed: int = 0,
+    ) -> Self:
         """Return the evidence with everything above `rung` taken out."""
         return cls(
             tuple(_seen_from(rung, t) for t in demonstrations),
             tuple(_seen_from(rung, t) for t in trials),
+            tuple(policies),
+            seed,
         )
 
     @property

@@ -1,23 +1,17 @@
 """The report: one self-contained HTML file, pictures and videos inside."""
 
-import base64
 from collections import Counter
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import jinja2
-from markupsafe import Markup
-
+from misstep.pages import data_url, render_page
 from misstep.paper import synthetic
 from misstep.paper.calibration import CALIBRATIONS
 from misstep.paper.claims import Claim
 from misstep.paper.printed import TABLE_1, TABLE_2
 from misstep.paper.results import Results
 from misstep.paper.videos import Video
-
-_MIME = {".png": "image/png", ".mp4": "video/mp4"}
 
 
 def render(
@@ -39,18 +33,16 @@ def render(
         Folder of the PNG files.
     videos : sequence of Video
     """
-    template = files("misstep.paper").joinpath("report.html.j2").read_text(encoding="utf-8")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    environment.filters["verdict_class"] = lambda verdict: verdict.replace(" ", "-")
     shown = results.demonstration_costs("without-reward")
     explored = results.costs("without-reward")
-    return environment.from_string(template).render(
+    return render_page(
+        "paper/report.html.j2",
         document=document,
         claims=claims,
         verdicts=Counter(claim.verdict for claim in claims).most_common(),
-        figure=lambda name: _data_url(figures / f"{name}.png"),
+        figure=lambda name: data_url(figures / f"{name}.png"),
         videos=[
-            (_data_url(v.path), f"{v.title}: {v.trajectory.mean_cost:.0f}° over 30 s")
+            (data_url(v.path), f"{v.title}: {v.trajectory.mean_cost:.0f}° over 30 s")
             for v in videos
         ],
         calibrations=CALIBRATIONS,
@@ -64,8 +56,3 @@ def render(
             "successes": sum(row["successes"] for row in document["tables"]["variants"]),
         },
     )
-
-
-def _data_url(path: Path) -> Markup:
-    content = base64.b64encode(path.read_bytes()).decode("ascii")
-    return Markup(f"data:{_MIME[path.suffix]};base64,{content}")  # noqa: S704 - base64 is inert

@@ -11,13 +11,9 @@ them again. Whatever is interrupted, at whatever moment, the same command or `mi
 on.
 """
 
-import multiprocessing
-import os
 import shutil
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -37,14 +33,13 @@ from misstep.paper.videos import VIDEOS, Video, choose_videos, write_video_once
 from misstep.runs import load_run, make_folder, read_json
 from misstep.storage import write_json, write_text
 from misstep.version import __version__, command_line
+from misstep.workers import Progress, Tally, check_workers, process_pool, silent
 
 Array = NDArray[np.float64]
 
 CONFIG = "reproduce.json"
 SEEDS = 30
 QUICK_SEEDS = 5
-
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
@@ -112,8 +107,7 @@ def reproduce(
     seeds = (QUICK_SEEDS if quick else SEEDS) if seeds is None else seeds
     if seeds < 1 or seed < 0:
         raise MisstepError(f"seeds must be at least 1 and seed at least 0, got {seeds} and {seed}")
-    if workers is not None and workers < 1:
-        raise MisstepError(f"workers is {workers}: at least one process is needed")
+    processes = check_workers(workers)
     config = ReproductionConfig(seeds=int(seeds), seed=int(seed), quick=quick)
     path = out / CONFIG
     if path.exists():
@@ -123,7 +117,7 @@ def reproduce(
         if any(out.glob("[!.]*")):
             raise MisstepError(f"{out} is not empty: choose a new or an empty folder")
         write_json(path, {**asdict(config), "command": list(command_line())})
-    return _run(out, config, workers or os.cpu_count() or 1, progress or _silent)
+    return _run(out, config, processes, progress or silent)
 
 
 def resume(out: Path, *, workers: int | None = None, progress: Progress | None = None) -> Path:
@@ -141,9 +135,9 @@ def resume(out: Path, *, workers: int | None = None, progress: Progress | None =
 
 def _run(out: Path, config: ReproductionConfig, workers: int, progress: Progress) -> Path:
     missing = [cell for cell in config.cells if not _cell_file(out, *cell).exists()]
-    tally = _Tally(progress, total=len(config.cells) + len(figures.FIGURES) + VIDEOS + 1)
+    tally = Tally(progress, total=len(config.cells) + len(figures.FIGURES) + VIDEOS + 1)
     tally.done = len(config.cells) - len(missing)
-    with _pool(workers) as pool:
+    with process_pool(workers) as pool:
         calibrations, synthetic = _measure_apart(config, pool)
         run = partial(_run_and_measure, out, config)
         for name, index in missing:
@@ -162,42 +156,6 @@ def _run(out: Path, config: ReproductionConfig, workers: int, progress: Progress
     _write_results(out, config, results, videos)
     tally.count("report")
     return out / "report.html"
-
-
-class _Tally:
-    """Waits for work in progress and reports each piece as it is done."""
-
-    def __init__(self, progress: Progress, total: int) -> None:
-        self.done = 0
-        self._progress = progress
-        self._total = total
-        self._expected: dict[Future[None], str] = {}
-
-    def expect(self, future: Future[None], what: str) -> None:
-        self._expected[future] = what
-
-    def wait(self) -> None:
-        """Wait for all that is expected; the first error ends it."""
-        for future in as_completed(self._expected):
-            future.result()
-            self.count(self._expected[future])
-        self._expected.clear()
-
-    def count(self, what: str) -> None:
-        self.done += 1
-        self._progress(self.done, self._total, what)
-
-
-@contextmanager
-def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Open processes that end with this one and drop what is waiting after an error."""
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, initializer=_end_with_parent) as pool:
-        try:
-            yield pool
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
 
 
 def _measure_apart(
@@ -303,20 +261,3 @@ def _check_same(path: Path, config: ReproductionConfig) -> None:
                 f"{path.parent} holds a reproduction with {name} {values[name]}, not {wanted}: "
                 f"choose another folder"
             )
-
-
-def _end_with_parent() -> None:
-    """Have a worker end when its parent does, however that ends."""
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        return
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def _silent(done: int, total: int, what: str) -> None:
-    """Show nothing."""

@@ -58,7 +58,19 @@ class CartPoleParameters:
     fall_angle_deg: float = parameter(
         30.0, "deg", "the pole has fallen beyond this angle", above=0, at_most=180
     )
-    stop_at_fall: bool = parameter(True, "", "end the episode when the pole has fallen")
+    track_limit: float = parameter(
+        0.0,
+        "m",
+        "the cart has left the track beyond this distance from its middle; 0: never",
+        at_least=0,
+    )
+    stop_at_fall: bool = parameter(True, "", "end the episode at a failure")
+    upright_time: float = parameter(
+        0.0, "s", "success is to be upright this long at the end; 0: to last", at_least=0
+    )
+    upright_angle_deg: float = parameter(
+        12.0, "deg", "the pole is upright within this angle", above=0, at_most=180
+    )
     delay: float = parameter(0.0, "s", "from an action to its force on the cart", at_least=0)
     position_noise: float = parameter(
         0.0, "m", "standard deviation of the noise on x as observed", at_least=0
@@ -73,18 +85,25 @@ class CartPoleParameters:
         0.0, "rad/s", "standard deviation of the noise on theta_dot as observed", at_least=0
     )
 
+    owner: ClassVar[str] = "cartpole"
+
     def __post_init__(self) -> None:
-        check_parameters(self, CartPole.system_id)
+        check_parameters(self, self.owner)
         if self.duration * self.control_rate < 1:
             raise MisstepError(
-                f"cartpole: duration is {self.duration:g} s, shorter than one control period "
+                f"{self.owner}: duration is {self.duration:g} s, shorter than one control period "
                 f"of {1 / self.control_rate:g} s"
+            )
+        if self.upright_time > self.duration:
+            raise MisstepError(
+                f"{self.owner}: upright_time is {self.upright_time:g} s but must be at most the "
+                f"duration, {self.duration:g} s"
             )
         timestep, longest = 1.0 / (self.control_rate * _substeps(self)), 1.0 / _fastest_rate(self)
         if timestep > longest:
             raise MisstepError(
-                f"cartpole: physics_step is {self.physics_step:g} s, too long to simulate how fast "
-                f"these masses, lengths and frictions move: it must be at most {longest:.2g} s"
+                f"{self.owner}: physics_step is {self.physics_step:g} s, too long to simulate how "
+                f"fast these masses, lengths and frictions move: it must be at most {longest:.2g} s"
             )
 
 
@@ -119,14 +138,22 @@ class CartPole(System):
     **Start**: at rest in the middle of the rail, theta drawn from a normal distribution with mean
     ``start_angle`` and standard deviation ``start_spread``.
 
-    **End**: *terminated* when the true ``|theta|`` exceeds ``fall_angle_deg`` and ``stop_at_fall``
-    is set; *truncated* when ``duration`` is over. Without ``stop_at_fall`` the pole goes on
-    swinging after its fall, as in the paper.
+    **Failure**: the true ``|theta|`` exceeds ``fall_angle_deg`` (180: never), or the true ``|x|``
+    exceeds ``track_limit`` (0: never).
+
+    **Success**: ``duration`` is over without a failure, and ``|theta|`` was below
+    ``upright_angle_deg`` during the whole last ``upright_time`` (0: whatever it was).
+
+    **End**: *terminated* at a failure if ``stop_at_fall`` is set; *truncated* when ``duration`` is
+    over. Without ``stop_at_fall`` the pole goes on swinging after its fall, as in the paper.
 
     **Info**
 
-    - ``failed`` (bool): the pole has fallen at some time in this episode;
-    - ``success`` (bool): ``duration`` is over and the pole has not fallen;
+    - ``failed`` (bool): there has been a failure in this episode, or ``duration`` is over without
+      success;
+    - ``success`` (bool): as above;
+    - ``timed_out`` (bool, from `step` only): failed for no other reason than that ``duration`` is
+      over without success;
     - ``force`` (float, N, from `step` only): force on the cart at the end of the step, after
       clipping and delay;
     - ``state`` (ndarray, shape (4,), only if an observation is noisy): the true state.
@@ -157,7 +184,12 @@ class CartPole(System):
         ``start_angle``             0.0      rad        mean angle at the start
         ``start_spread``            0.05     rad        its standard deviation
         ``fall_angle_deg``          30.0     deg        the pole has fallen beyond this angle
-        ``stop_at_fall``            True                end the episode at the fall
+        ``track_limit``             0.0      m          the cart has left the track beyond this
+                                                        distance from its middle; 0: never
+        ``stop_at_fall``            True                end the episode at a failure
+        ``upright_time``            0.0      s          success is to be upright this long at
+                                                        the end; 0: to last
+        ``upright_angle_deg``       12.0     deg        the pole is upright within this angle
         ``delay``                   0.0      s          from an action to its force, rounded
                                                         to steps of the simulation
         ``position_noise``          0.0      m          sensor noise, standard deviation
@@ -181,11 +213,12 @@ class CartPole(System):
 
     **Version history**
 
-    - v1 (``misstep/CartPole-v1``): first version.
+    - v1 (``misstep/CartPole-v1``): first version. ``track_limit``, ``upright_time`` and
+      ``upright_angle_deg`` came later; their defaults change nothing.
     """
 
     system_id: ClassVar[str] = "cartpole"
-    parameters_type: ClassVar[type] = CartPoleParameters
+    parameters_type: ClassVar[type[CartPoleParameters]] = CartPoleParameters
     observation_columns = (
         Column("x", "m"),
         Column("x_dot", "m/s"),
@@ -196,9 +229,11 @@ class CartPole(System):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
 
     def __init__(self, render_mode: str | None = None, **parameters: ParameterValue) -> None:
-        p = build_parameters(CartPoleParameters, self.system_id, parameters)
+        p = build_parameters(self.parameters_type, self.system_id, parameters)
         if render_mode not in (None, "rgb_array"):
-            raise MisstepError(f"cartpole: render_mode is {render_mode!r}; there is: 'rgb_array'")
+            raise MisstepError(
+                f"{self.system_id}: render_mode is {render_mode!r}; there is: 'rgb_array'"
+            )
         self.render_mode = render_mode
         self.parameters = asdict(p)
         self.metadata = {**self.metadata, "render_fps": round(p.control_rate)}
@@ -210,11 +245,14 @@ class CartPole(System):
         self.action_space = gymnasium.spaces.Box(-limit, limit, shape=(1,), dtype=np.float64)
 
         # Upright and near the middle; weights in 1/m², s²/m², 1, s².
-        limits = (p.rail, math.inf, math.inf, math.inf)
+        limits = (min(p.rail, p.track_limit or math.inf), math.inf, math.inf, math.inf)
         self.cost = StateCost((0.0, 0.0, 0.0, 0.0), (0.5, 0.05, 10.0, 0.1), limits)
         self._force_limit = limit
         self._fall_angle = math.radians(p.fall_angle_deg)
+        self._track_limit = p.track_limit or math.inf
         self._stop_at_fall = p.stop_at_fall
+        self._upright_angle = math.radians(p.upright_angle_deg)
+        self._upright_steps = round(p.upright_time * p.control_rate)
         self._start = (p.start_angle, p.start_spread)
         self._n_steps = round(p.duration * p.control_rate)
         noise = (p.position_noise, p.velocity_noise, p.angle_noise, p.angular_velocity_noise)
@@ -236,6 +274,7 @@ class CartPole(System):
         self._painter: Any = None
         self._over = True
         self._failed = False
+        self._held = 0
         self._t = 0
 
     @property
@@ -253,14 +292,18 @@ class CartPole(System):
         """
         values = (x, x_dot, theta, theta_dot)
         if not all(map(math.isfinite, values)):
-            raise MisstepError(f"cartpole: the state {values} holds a number that is not finite")
+            raise MisstepError(
+                f"{self.system_id}: the state {values} holds a number that is not finite"
+            )
         mujoco.mj_resetData(self.model, self.data)
         self._qpos[:] = x, theta
         self._qvel[:] = x_dot, theta_dot
         self._pending = deque([0.0] * self._delay_periods)
         self._force = 0.0
         self._t = 0
-        self._failed = abs(wrap_angle(theta)) > self._fall_angle
+        self._failed = self._is_failure(x, wrap_angle(theta))
+        self._held = -1
+        self._hold(wrap_angle(theta))
         self._over = False
 
     def reset(
@@ -278,7 +321,7 @@ class CartPole(System):
         super().reset(seed=seed)
         mean, spread = self._start
         self.set_state(0.0, 0.0, mean + spread * self.np_random.standard_normal(), 0.0)
-        observation, true_state, _ = self._observe()
+        observation, true_state, _, _ = self._observe()
         return observation, {"failed": self._failed, "success": False, **true_state}
 
     def step(
@@ -293,33 +336,49 @@ class CartPole(System):
             simulation diverges.
         """
         if self._over:
-            raise MisstepError("cartpole: no episode is running; call reset() before step()")
+            raise MisstepError(
+                f"{self.system_id}: no episode is running; call reset() before step()"
+            )
         self._advance(self._clipped(action))
         self._t += 1
 
-        observation, true_state, theta = self._observe()
-        self._failed = self._failed or abs(theta) > self._fall_angle
+        observation, true_state, x, theta = self._observe()
+        self._failed = self._failed or self._is_failure(x, theta)
+        self._hold(theta)
         terminated = self._failed and self._stop_at_fall
         truncated = self._t >= self._n_steps
         self._over = terminated or truncated
+        lasted = truncated and not self._failed
+        success = lasted and self._held >= self._upright_steps
         info = {
-            "failed": self._failed,
-            "success": truncated and not self._failed,
+            "failed": self._failed or (lasted and not success),
+            "success": success,
+            "timed_out": lasted and not success,
             "force": self._force,
             **true_state,
         }
         return observation, -math.degrees(abs(theta)), terminated, truncated, info
 
+    def _is_failure(self, x: float, theta: float) -> bool:
+        return abs(theta) > self._fall_angle or abs(x) > self._track_limit
+
+    def _hold(self, theta: float) -> None:
+        """Count the control periods for which the pole has been upright, from 0 to now."""
+        upright = self._upright_steps == 0 or abs(theta) < self._upright_angle
+        self._held = self._held + 1 if upright else -1
+
     def _clipped(self, action: NDArray[np.float64]) -> float:
         action = np.asarray(action)
         if action.shape != (1,):
             raise MisstepError(
-                f"cartpole: the action has shape {action.shape} but one force in N, shape (1,), "
-                "is wanted"
+                f"{self.system_id}: the action has shape {action.shape} but one force in N, "
+                "shape (1,), is wanted"
             )
         force = float(action[0])
         if not math.isfinite(force):
-            raise MisstepError(f"cartpole: the action is {force} N, which is not a finite force")
+            raise MisstepError(
+                f"{self.system_id}: the action is {force} N, which is not a finite force"
+            )
         return min(max(force, -self._force_limit), self._force_limit)
 
     def _advance(self, force: float) -> None:
@@ -336,22 +395,22 @@ class CartPole(System):
         # Beyond half a turn a step the simulation means nothing, and soon it is no number any more.
         if not (math.isfinite(x + x_dot) and abs(theta_dot) * self._timestep < math.pi):
             raise MisstepError(
-                f"cartpole: after {self._t * self.dt:.2f} s the pole turns at {theta_dot:.3g} "
-                f"rad/s, too fast for a physics_step of {self._timestep:g} s: set a "
-                "smaller physics_step or force_limit"
+                f"{self.system_id}: after {self._t * self.dt:.2f} s the pole turns at "
+                f"{theta_dot:.3g} rad/s, too fast for a physics_step of {self._timestep:g} s: set "
+                "a smaller physics_step or force_limit"
             )
         return x, x_dot, wrap_angle(theta), theta_dot
 
-    def _observe(self) -> tuple[NDArray[np.float64], dict[str, Any], float]:
-        """Return what the sensors show, the true state as an info if they are noisy, and theta."""
+    def _observe(self) -> tuple[NDArray[np.float64], dict[str, Any], float, float]:
+        """Return what the sensors show, the true state as an info if they are noisy, x, theta."""
         values = self._true_state()
-        theta = values[2]
+        x, _, theta, _ = values
         state = np.array(values)
         if self._noise is None:
-            return state, {}, theta
+            return state, {}, x, theta
         observation = state + self._noise * self.np_random.standard_normal(4)
         observation[2] = wrap_angle(float(observation[2]))
-        return observation, {"state": state}, theta
+        return observation, {"state": state}, x, theta
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return a picture of the true state, shape (360, 640, 3), with ``"rgb_array"``."""

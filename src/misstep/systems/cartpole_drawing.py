@@ -12,16 +12,27 @@ from collections.abc import Iterator, Mapping
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageColor, ImageDraw
 
 from misstep.parameters import ParameterValue, build_parameters
 from misstep.systems.cartpole import CartPoleParameters, cartpole_spec
+from misstep.systems.drawing import (
+    BLUE,
+    DARK,
+    FLOOR,
+    GREY,
+    LIGHT,
+    MARK,
+    ORANGE,
+    RED,
+    STEEL,
+    STOP,
+    Canvas,
+    light,
+    rgba,
+)
 from misstep.systems.offscreen import Offscreen
 
-SKY_ABOVE, SKY_BELOW = "#e1e9f0", "#fbfcfd"
-FLOOR, RAIL, MARK, STOP = "#c9d3dd", "#77838f", "#f4f6f8", "#a34a44"
-CART, WHEEL, HINGE = "#2b3442", "#566273", "#f4f6f8"
-POLE, FALLEN, FORCE = "#2f6db5", "#c8402f", "#f07f2b"
+RAIL, CART, WHEEL, HINGE, POLE, FALLEN, FORCE = STEEL, DARK, GREY, LIGHT, BLUE, RED, ORANGE
 
 # In units of the half-length.
 CART_HALF_LENGTH, CART_HALF_HEIGHT = 0.38, 0.16
@@ -36,12 +47,25 @@ VIEW_CENTRE, VIEW_HEIGHT = -0.1, 5.0
 MARKS_PER_METRE, MARKS_PER_LONG_MARK = 10, 5
 _MOST_MARKS = 150  # more than this in view are too dense to see
 
-COLUMNS = ("x", "theta")
-ACTION_COLUMN = "force"
-
 
 class _CartPoleView:
     """What the two drawings have in common: the parameters and what follows from them."""
+
+    columns: tuple[str, ...] = ("x", "theta")
+    action_column = "force"
+    slow_motion = 1.0
+    hold = 0.0
+
+    @staticmethod
+    def caption(
+        observation: Mapping[str, float], action: Mapping[str, float], time: float
+    ) -> list[tuple[str, str, str]]:
+        """Return name, value and unit of what is written beside the picture."""
+        return [
+            ("angle", f"{math.degrees(observation['theta']):+.1f}", "°"),
+            ("force", f"{action['force']:+.1f}", "N"),
+            ("time", f"{time:.2f}", "s"),
+        ]
 
     def __init__(self, parameters: Mapping[str, ParameterValue], width: int, height: int) -> None:
         self.p = build_parameters(CartPoleParameters, "cartpole", parameters)
@@ -92,7 +116,7 @@ class CartPoleScene(_CartPoleView):
     def __init__(self, parameters: Mapping[str, ParameterValue], width: int, height: int) -> None:
         super().__init__(parameters, width, height)
         spec = cartpole_spec(self.p)
-        _light(spec)
+        light(spec)
         self._build(spec)
         self._screen = Offscreen(spec, width, height)
         field_of_view = math.radians(self._screen.model.vis.global_.fovy)
@@ -115,55 +139,55 @@ class CartPoleScene(_CartPoleView):
             type=box,
             size=[reach + 12.0 * u, FLOOR_HALF_DEPTH * u, 0.05 * u],
             pos=[0, 0, (FLOOR_HEIGHT - 0.05) * u],
-            rgba=_rgba(FLOOR),
+            rgba=rgba(FLOOR),
         )
         world.add_geom(
             type=box,
             size=[reach + 0.1 * u, 0.1 * u, RAIL_HALF_THICKNESS * u],
             pos=[0, 0, rail_z],
-            rgba=_rgba(RAIL),
+            rgba=rgba(RAIL),
         )
         for side in (-1, 1):
             world.add_geom(
                 type=box,
                 size=[STOP_HALF_LENGTH * u, 0.15 * u, STOP_HALF_HEIGHT * u],
                 pos=[side * reach, 0, rail_z + STOP_HALF_HEIGHT * u],
-                rgba=_rgba(STOP),
+                rgba=rgba(STOP),
             )
             wheel_x, wheel_z = side * WHEEL_OFFSET * u, -CART_HALF_HEIGHT * u
             cart.add_geom(
                 type=cylinder,
                 size=[WHEEL_RADIUS * u, 0, 0],
                 fromto=[wheel_x, -0.21 * u, wheel_z, wheel_x, 0.21 * u, wheel_z],
-                rgba=_rgba(WHEEL),
+                rgba=rgba(WHEEL),
             )
         cart.add_geom(
             type=box,
             size=[CART_HALF_LENGTH * u, 0.2 * u, CART_HALF_HEIGHT * u],
-            rgba=_rgba(CART),
+            rgba=rgba(CART),
         )
         pole.add_geom(
             name="pole",
             type=capsule,
             size=[POLE_RADIUS * u, 0, 0],
             fromto=[0, -0.28 * u, 0, 0, -0.28 * u, 2.0 * u],
-            rgba=_rgba(POLE),
+            rgba=rgba(POLE),
         )
         pole.add_geom(
             type=cylinder,
             size=[HINGE_RADIUS * u, 0, 0],
             fromto=[0, -0.2 * u, 0, 0, -0.345 * u, 0],
-            rgba=_rgba(HINGE),
+            rgba=rgba(HINGE),
         )
 
     def draw(
         self, observation: Mapping[str, float], action: Mapping[str, float]
     ) -> NDArray[np.uint8]:
         """Return a picture, shape (height, width, 3), of x [m], theta [rad] and force [N]."""
-        x, theta, force = observation["x"], observation["theta"], action[ACTION_COLUMN]
+        x, theta, force = observation["x"], observation["theta"], action["force"]
         u, screen = self.unit, self._screen
         screen.data.qpos[:] = x, theta
-        screen.model.geom("pole").rgba = _rgba(self.pole_colour(theta))
+        screen.model.geom("pole").rgba = rgba(self.pole_colour(theta))
         screen.camera.lookat[:] = x, 0.0, VIEW_CENTRE * u
         screen.look()
         for place, long in self.marks(x):
@@ -172,7 +196,7 @@ class CartPoleScene(_CartPoleView):
             screen.add_box(
                 (0.014 * u, 0.005 * u, half_height),
                 (place, -0.1 * u, top - half_height),
-                _rgba(MARK),
+                rgba(MARK),
             )
         start, end = self.arrow(force)
         if start != end:
@@ -180,7 +204,7 @@ class CartPoleScene(_CartPoleView):
                 (x + start, -0.3 * u, 0.0),
                 (x + end, -0.3 * u, 0.0),
                 ARROW_THICKNESS * u,
-                _rgba(FORCE),
+                rgba(FORCE),
             )
         return screen.picture()
 
@@ -192,107 +216,41 @@ class CartPoleScene(_CartPoleView):
 class CartPoleSketch(_CartPoleView):
     """A cart-pole as a flat drawing; takes the place of `CartPoleScene` without OpenGL."""
 
-    _FINER = 2  # drawn this much larger and then reduced, for smooth edges
-
     def draw(
         self, observation: Mapping[str, float], action: Mapping[str, float]
     ) -> NDArray[np.uint8]:
         """Return a picture, shape (height, width, 3), of x [m], theta [rad] and force [N]."""
-        x, theta, force = observation["x"], observation["theta"], action[ACTION_COLUMN]
-        self._image = Image.new(
-            "RGB", (self.width * self._FINER, self.height * self._FINER), SKY_BELOW
-        )
-        self._pen = ImageDraw.Draw(self._image)
-        self._x = x
+        x, theta, force = observation["x"], observation["theta"], action["force"]
         u, reach = self.unit, self.stop_centre()
-        self._box(-reach - 2 * u, FLOOR_HEIGHT * u, reach + 2 * u, -10 * u, FLOOR)
+        centre = (x, VIEW_CENTRE * u)
+        canvas = Canvas(self.width, self.height, VIEW_HEIGHT * u, centre)
+        canvas.box(-reach - 2 * u, FLOOR_HEIGHT * u, reach + 2 * u, -10 * u, FLOOR)
         rail_top = (RAIL_HEIGHT + RAIL_HALF_THICKNESS) * u
         rail_bottom = (RAIL_HEIGHT - RAIL_HALF_THICKNESS) * u
-        self._box(-reach - 0.1 * u, rail_top, reach + 0.1 * u, rail_bottom, RAIL)
+        canvas.box(-reach - 0.1 * u, rail_top, reach + 0.1 * u, rail_bottom, RAIL)
         for place, long in self.marks(x):
             length = (1.4 if long else 0.7) * RAIL_HALF_THICKNESS * u
-            self._box(place - 0.014 * u, rail_top, place + 0.014 * u, rail_top - length, MARK)
+            canvas.box(place - 0.014 * u, rail_top, place + 0.014 * u, rail_top - length, MARK)
         for side in (-reach, reach):
             half = STOP_HALF_LENGTH * u
             top = (RAIL_HEIGHT + 2 * STOP_HALF_HEIGHT) * u
-            self._box(side - half, top, side + half, rail_bottom, STOP)
-        self._draw_cart(x)
+            canvas.box(side - half, top, side + half, rail_bottom, STOP)
+        self._draw_cart(canvas, x)
         tip = (x + 2 * u * math.sin(theta), 2 * u * math.cos(theta))
-        self._line((x, 0.0), tip, 2 * POLE_RADIUS * u, self.pole_colour(theta))
-        self._disc((x, 0.0), HINGE_RADIUS * u, HINGE)
-        self._draw_arrow(x, force)
-        return np.asarray(self._image.reduce(self._FINER))
+        canvas.line((x, 0.0), tip, 2 * POLE_RADIUS * u, self.pole_colour(theta))
+        canvas.disc((x, 0.0), HINGE_RADIUS * u, HINGE)
+        start, end = self.arrow(force)
+        if start != end:
+            canvas.arrow((x + start, 0.0), (x + end, 0.0), 2 * ARROW_THICKNESS * u, FORCE)
+        return canvas.picture()
 
     def close(self) -> None:
         """Nothing is held."""
 
-    def _draw_cart(self, x: float) -> None:
+    def _draw_cart(self, canvas: Canvas, x: float) -> None:
         u = self.unit
         for side in (-1, 1):
             wheel = (x + side * WHEEL_OFFSET * u, -CART_HALF_HEIGHT * u)
-            self._disc(wheel, WHEEL_RADIUS * u, WHEEL)
+            canvas.disc(wheel, WHEEL_RADIUS * u, WHEEL)
         half_length, half_height = CART_HALF_LENGTH * u, CART_HALF_HEIGHT * u
-        self._box(x - half_length, half_height, x + half_length, -half_height, CART)
-
-    def _draw_arrow(self, x: float, force: float) -> None:
-        start, end = self.arrow(force)
-        if start == end:
-            return
-        thickness = 2 * ARROW_THICKNESS * self.unit
-        head = math.copysign(min(abs(end - start), 1.5 * thickness), force)
-        neck = x + end - head
-        half = thickness / 2
-        self._box(x + start, half, neck, -half, FORCE)
-        corners = [(neck, thickness), (x + end, 0.0), (neck, -thickness)]
-        self._pen.polygon([self._pixel(*corner) for corner in corners], fill=FORCE)
-
-    def _pixel(self, x: float, z: float) -> tuple[float, float]:
-        scale = self._FINER * self.height / (VIEW_HEIGHT * self.unit)
-        middle_x, middle_z = 0.5 * self.width * self._FINER, 0.5 * self.height * self._FINER
-        return middle_x + (x - self._x) * scale, middle_z - (z - VIEW_CENTRE * self.unit) * scale
-
-    def _box(self, left: float, top: float, right: float, bottom: float, colour: str) -> None:
-        (x0, y0), (x1, y1) = self._pixel(left, top), self._pixel(right, bottom)
-        self._pen.rectangle((min(x0, x1), y0, max(x0, x1), y1), fill=colour)
-
-    def _disc(self, centre: tuple[float, float], radius: float, colour: str) -> None:
-        x, z = centre
-        (x0, y0), (x1, y1) = (
-            self._pixel(x - radius, z + radius),
-            self._pixel(x + radius, z - radius),
-        )
-        self._pen.ellipse((x0, y0, x1, y1), fill=colour)
-
-    def _line(
-        self, start: tuple[float, float], end: tuple[float, float], width: float, colour: str
-    ) -> None:
-        pixels = width * self._FINER * self.height / (VIEW_HEIGHT * self.unit)
-        self._pen.line([self._pixel(*start), self._pixel(*end)], fill=colour, width=round(pixels))
-        self._disc(end, width / 2, colour)
-
-
-def _light(spec: mujoco.MjSpec) -> None:
-    """Light the scene from the camera and from above, before a seamless backdrop."""
-    spec.visual.global_.fovy = 30.0
-    headlight = spec.visual.headlight
-    headlight.ambient, headlight.diffuse, headlight.specular = [0.55] * 3, [0.35] * 3, [0.0] * 3
-    spec.worldbody.add_light(
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        dir=[0.2, 0.3, -1.0],
-        diffuse=[0.4] * 3,
-        specular=[0.0] * 3,
-        castshadow=False,
-    )
-    spec.add_texture(
-        name="backdrop",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=_rgba(SKY_ABOVE)[:3],
-        rgb2=_rgba(SKY_BELOW)[:3],
-        width=128,
-        height=128,
-    )
-
-
-def _rgba(colour: str) -> list[float]:
-    return [channel / 255 for channel in ImageColor.getrgb(colour)] + [1.0]
+        canvas.box(x - half_length, half_height, x + half_length, -half_height, CART)

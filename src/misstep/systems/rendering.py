@@ -20,17 +20,48 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from misstep.errors import MisstepError
-from misstep.parameters import ParameterValue
+from misstep.parameters import ParameterValue, parameter_table
 from misstep.storage import atomic_write
+from misstep.systems import JUDGE_PARAMETERS, SYSTEMS
+from misstep.systems.basket_drawing import BasketScene, BasketSketch
 from misstep.systems.cartpole_drawing import CartPoleScene, CartPoleSketch
+from misstep.systems.drawing import DARK, GREEN, RED
+from misstep.systems.flipup_drawing import FlipUpScene, FlipUpSketch
 from misstep.systems.offscreen import NoOpenGLError
-from misstep.trajectory import Trajectory
+from misstep.trajectory import Outcome, Trajectory
 
-INK, FAINT = "#2b3442", "#6b7785"
+INK, FAINT = DARK, "#6b7785"
+_OUTCOME_COLOURS = {Outcome.SUCCESS: GREEN, Outcome.FAILURE: RED}
 
 
 class Drawing(Protocol):
-    """Draws the states of one system, of one size."""
+    """Draws the states of one system, of one size.
+
+    Attributes
+    ----------
+    columns : tuple of str
+        Observation columns that it needs.
+    action_column : str
+        Action column that it needs.
+    slow_motion : float
+        A video plays this much slower than the attempt went.
+    hold : float, s
+        A video stays on the last picture for this long.
+    """
+
+    columns: tuple[str, ...]
+    action_column: str
+    slow_motion: float
+    hold: float
+
+    def __init__(
+        self, parameters: Mapping[str, ParameterValue], width: int, height: int, /
+    ) -> None: ...
+
+    def caption(
+        self, observation: Mapping[str, float], action: Mapping[str, float], time: float, /
+    ) -> list[tuple[str, str, str]]:
+        """Return name, value and unit of what is written beside the picture."""
 
     def draw(
         self, observation: Mapping[str, float], action: Mapping[str, float]
@@ -42,18 +73,24 @@ class Drawing(Protocol):
 
 
 # By system: with OpenGL, and without.
-_DRAWINGS = {"cartpole": (CartPoleScene, CartPoleSketch)}
+_DRAWINGS: dict[str, tuple[type[Drawing], type[Drawing]]] = {
+    "cartpole": (CartPoleScene, CartPoleSketch),
+    "cartpole-rail": (CartPoleScene, CartPoleSketch),
+    "cartpole-swingup": (CartPoleScene, CartPoleSketch),
+    "flipup": (FlipUpScene, FlipUpSketch),
+    "basket": (BasketScene, BasketSketch),
+}
 
 
 class Painter:
-    """Draws states of one system with a caption: title, angle, force, time.
+    """Draws states of one system with a caption: title, what was seen and done, time, outcome.
 
     A context manager; leaving it gives back what OpenGL holds.
 
     Parameters
     ----------
     system : str
-        Name of a system of which there are drawings: ``"cartpole"``.
+        Name of a system of which there are drawings: ``"cartpole"``, ``"flipup"``, ``"basket"``.
     parameters : mapping
         Parameters of the system.
     width, height : int, px
@@ -81,10 +118,7 @@ class Painter:
         height: int = 360,
         title: str = "",
     ) -> None:
-        if system not in _DRAWINGS:
-            raise MisstepError(
-                f"there is no drawing of the system {system!r}; there are: {', '.join(_DRAWINGS)}"
-            )
+        _check_drawn(system)
         if width % 2 or height % 2 or min(width, height) < 64:
             raise MisstepError(
                 f"the size of a picture is {width} × {height}: both must be even and at least 64"
@@ -98,32 +132,39 @@ class Painter:
         )
 
     def paint(
-        self, observation: Mapping[str, float], action: Mapping[str, float], time: float
+        self,
+        observation: Mapping[str, float],
+        action: Mapping[str, float],
+        time: float,
+        outcome: str = "",
     ) -> NDArray[np.uint8]:
         """Return a picture, shape (height, width, 3).
 
         Parameters
         ----------
         observation : mapping
-            ``x`` [m] and ``theta`` [rad]; others are ignored.
+            What the drawing needs, in the system's units: of a cart-pole ``x`` and ``theta``;
+            others are ignored.
         action : mapping
-            ``force`` [N].
+            Likewise: ``force`` of a cart-pole, ``velocity`` of an effector.
         time : float, s
+        outcome : str
+            ``"success"`` or ``"failure"`` to have it written below the time.
         """
         picture = Image.fromarray(self._drawing.draw(observation, action))
         pen = ImageDraw.Draw(picture)
         s = self._scale
         pen.text((20 * s, 16 * s), self._title, INK, self._large)
-        values = [
-            ("angle", f"{math.degrees(observation['theta']):+.1f}", "°"),
-            ("force", f"{action['force']:+.1f}", "N"),
-            ("time", f"{time:.2f}", "s"),
-        ]
+        values = self._drawing.caption(observation, action, time)
         for row, (name, value, unit) in enumerate(values):
             y = (16 + 21 * row) * s
             pen.text((self._width - 146 * s, y), name, FAINT, self._small)
             pen.text((self._width - 38 * s, y), value, INK, self._small, anchor="ra")
             pen.text((self._width - 33 * s, y), unit, FAINT, self._small)
+        if outcome:
+            colour = _OUTCOME_COLOURS[Outcome(outcome)]
+            y = (16 + 21 * len(values)) * s
+            pen.text((self._width - 38 * s, y), outcome, colour, self._small, anchor="ra")
         return np.asarray(picture)
 
     def close(self) -> None:
@@ -151,12 +192,16 @@ def frames(
 ) -> Iterator[NDArray[np.uint8]]:
     """Draw a recorded trajectory, from its first observation to its last.
 
+    The strikes of flip-up and basket last a tenth of a second: they are shown ten times slower than
+    they went, and their end, where the outcome is written, for a second.
+
     Parameters
     ----------
     trajectory : Trajectory
-        Must observe ``x`` and ``theta`` and act with ``force``.
+        Must observe and act with what the drawing of its system needs: a cart-pole's ``x``,
+        ``theta`` and ``force``, every column of the others.
     fps : float, 1/s
-        Frame k shows the observation at the time k / fps and the action sent then.
+        Frame k shows the observation at the time k / fps, slowed down, and the action sent then.
     width, height : int, px
     title : str
 
@@ -171,16 +216,20 @@ def frames(
         If a column is missing, there is no drawing of the system, or a size or the rate is wrong.
     """
     # Checked here and not in the generator, whose body runs only when the first frame is wanted.
-    observations = _columns(trajectory, trajectory.observations, ("x", "theta"))
-    actions = _columns(trajectory, trajectory.actions, ("force",))
-    shown = _shown_steps(trajectory, fps)
     source = trajectory.provenance
+    drawing = _check_drawn(source.system)
+    observations = _columns(trajectory, trajectory.observations, drawing.columns)
+    actions = _columns(trajectory, trajectory.actions, (drawing.action_column,))
+    shown = _shown_steps(trajectory, fps)
     painter = Painter(source.system, source.parameters, width=width, height=height, title=title)
-    return _paint_all(painter, observations, actions, shown, trajectory.dt)
+    return _paint_all(painter, trajectory, observations, actions, shown)
 
 
 def n_frames(trajectory: Trajectory, fps: float = 20.0) -> int:
-    """Return the number of frames of a trajectory: its start, and one every 1 / fps seconds."""
+    """Return the number of frames of a trajectory: its start, and one every 1 / fps seconds.
+
+    Seconds of the video, that is, in which strikes are shown slowed down.
+    """
     return len(_shown_steps(trajectory, fps))
 
 
@@ -198,7 +247,7 @@ def write_video(
     Parameters
     ----------
     trajectory : Trajectory
-        Must observe ``x`` and ``theta`` and act with ``force``.
+        As for `frames`.
     path : path
         Ends in ``.mp4``.
     fps : float, 1/s
@@ -217,15 +266,35 @@ def write_video(
     atomic_write(path, lambda temporary: _encode(pictures, temporary, fps, (width, height)))
 
 
+def _check_drawn(system: str) -> type[Drawing]:
+    """Return how the system is drawn with OpenGL."""
+    if system not in _DRAWINGS:
+        raise MisstepError(
+            f"there is no drawing of the system {system!r}; there are: {', '.join(_DRAWINGS)}"
+        )
+    return _DRAWINGS[system][0]
+
+
 def _drawing(
     system: str, parameters: Mapping[str, ParameterValue], width: int, height: int
 ) -> Drawing:
     with_opengl, without = _DRAWINGS[system]
+    shown = _shown_parameters(system, parameters)
     try:
-        return with_opengl(parameters, width, height)
+        return with_opengl(shown, width, height)
     except NoOpenGLError as error:
         _tell_flat(str(error))
-        return without(parameters, width, height)
+        return without(shown, width, height)
+
+
+def _shown_parameters(
+    system: str, parameters: Mapping[str, ParameterValue]
+) -> dict[str, ParameterValue]:
+    """Return the system's own parameters, defaults included; how it is judged is not seen."""
+    defaults = {row.name: row.default for row in parameter_table(SYSTEMS[system].parameters_type)}
+    judges = {row.name for row in JUDGE_PARAMETERS}
+    own = {name: value for name, value in parameters.items() if name not in judges}
+    return {**defaults, **own}
 
 
 @functools.cache
@@ -259,26 +328,36 @@ def _shown_steps(trajectory: Trajectory, fps: float) -> NDArray[np.intp]:
     if not (math.isfinite(fps) and fps > 0):
         raise MisstepError(f"fps is {fps}: it must be a positive number of frames per second")
     # The margin keeps a frame that falls on an observation there, in floating point.
-    count = math.floor(trajectory.duration * fps + 1e-6) + 1
-    steps = np.floor(np.arange(count) / fps / trajectory.dt + 1e-6).astype(np.intp)
-    return np.minimum(steps, trajectory.n_steps)
+    drawing = _check_drawn(trajectory.provenance.system)
+    rate = fps * drawing.slow_motion
+    count = math.floor(trajectory.duration * rate + 1e-6) + 1
+    steps = np.floor(np.arange(count) / rate / trajectory.dt + 1e-6).astype(np.intp)
+    held = np.full(math.floor(drawing.hold * fps), trajectory.n_steps, np.intp)
+    return np.concatenate([np.minimum(steps, trajectory.n_steps), held])
 
 
 def _paint_all(
     painter: Painter,
+    trajectory: Trajectory,
     observations: Mapping[str, NDArray[np.float64]],
     actions: Mapping[str, NDArray[np.float64]],
     shown: NDArray[np.intp],
-    dt: float,
 ) -> Iterator[NDArray[np.uint8]]:
     with painter:
         for step in shown:
-            last_action = len(actions["force"]) - 1
+            acted = min(step, trajectory.n_steps - 1)
             yield painter.paint(
                 {name: float(column[step]) for name, column in observations.items()},
-                {name: float(column[min(step, last_action)]) for name, column in actions.items()},
-                step * dt,
+                {name: float(column[acted]) for name, column in actions.items()},
+                step * trajectory.dt,
+                _verdict(trajectory, step),
             )
+
+
+def _verdict(trajectory: Trajectory, step: int) -> str:
+    """Return the outcome at the last observation; empty before, and where nobody knows it."""
+    over = step == trajectory.n_steps and trajectory.outcome is not Outcome.UNKNOWN
+    return str(trajectory.outcome) if over else ""
 
 
 def _encode(

@@ -22,7 +22,9 @@ class System(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     `step` returns minus the cost of the step as its reward, and in its `info`
 
     - ``failed`` (bool): the failure predicate has held at some time in this episode;
-    - ``success`` (bool): the task is done.
+    - ``success`` (bool): the task is done;
+    - ``timed_out`` (bool, where it can happen): ``failed`` for no other reason than that the
+      episode is over without success.
 
     `reset` returns ``failed`` in its `info` too: an episode can start in a failure.
 
@@ -49,3 +51,8 @@ class System(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     action_columns: tuple[Column, ...]
     parameters: dict[str, ParameterValue]
     cost: StateCost | None = None
+
+    @property
+    def unwrapped(self) -> "System":
+        """The system itself; the one inside where this is a system around a system."""
+        return self

@@ -1,0 +1,193 @@
+"""The baselines and searches: random-linear, hill-climbing, cma-es, power, and between failures."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from misstep import demonstrate, learn, make_system
+from misstep.errors import MisstepError
+from misstep.learners import LEARNERS, Evidence, Task
+from misstep.learners.linear import LinearPolicy, LinearSpace, time_lasted
+from misstep.learners.search import total_cost
+from misstep.trajectory import Column, Outcome, Provenance, Trajectory
+
+STATE = ("theta", "theta_dot")
+SEARCHES = ["random-linear", "hill-climbing", "cma-es", "power"]
+
+
+@pytest.fixture(scope="module")
+def system():
+    return make_system("cartpole")
+
+
+@pytest.fixture(scope="module")
+def shown(system):
+    return demonstrate(system, "noisy", seed=5)
+
+
+@pytest.fixture(scope="module")
+def space(system, shown):
+    return LinearSpace(Task.of(system, STATE), list(shown))
+
+
+def test_vectors_and_policies_are_two_names_for_the_same(space):
+    vector = np.random.default_rng(0).normal(size=3)
+    np.testing.assert_allclose(space.vector(space.policy(vector)), vector, rtol=1e-12)
+    # A gain of 1: full force at one standard deviation of that column.
+    policy = space.policy(np.array([0.0, 1.0, 0.0]))
+    observation = np.array([9.0, 9.0, 0.5 * space.spread[0], 9.0])
+    assert policy(observation)[0] == pytest.approx(10.0)
+
+
+def test_the_average_is_least_squares_without_its_bias(space, shown):
+    states = np.concatenate([t.select(STATE)[:-1] for t in shown])
+    forces = np.concatenate([t.actions for t in shown])
+    design = np.column_stack([np.ones(len(states)), states])
+    expected = np.linalg.solve(design.T @ design, design.T @ forces)[1:, 0]
+    policy = space.policy(space.average())
+    np.testing.assert_allclose(policy.gain[0], expected, rtol=1e-9)
+    assert policy.bias[0] == 0.0
+
+
+def test_perturbations_have_the_size_that_was_asked_for(space):
+    rng = np.random.default_rng(1)
+    draws = np.array([space.perturbed(np.ones(3), 0.3, rng) for _ in range(4000)])
+    assert np.all(draws[:, 0] == 1.0)
+    np.testing.assert_allclose(draws[:, 1:].std(axis=0), 0.3, rtol=0.05)
+
+
+@pytest.mark.parametrize("learner", SEARCHES)
+def test_a_search_balances_within_forty_trials(system, shown, learner):
+    run = learn(system, shown, learner, state=STATE, max_trials=40, seed=1)
+    assert run.succeeded
+
+
+@pytest.mark.parametrize("learner", SEARCHES)
+def test_a_search_that_is_resumed_goes_on_as_if_it_had_not_stopped(
+    system, shown, learner, tmp_path
+):
+    from misstep import load_run, resume
+
+    settings = {"state": STATE, "max_trials": 14, "seed": 3, "stop_on_success": False}
+    whole = learn(system, shown, learner, **settings)
+    learn(system, shown, learner, out=tmp_path / "run", **{**settings, "max_trials": 14})
+    for path in sorted((tmp_path / "run" / "trials").iterdir())[9:]:
+        path.unlink()
+    again = resume(load_run(tmp_path / "run"))
+    for ours, theirs in zip(whole.trials, again.trials, strict=True):
+        np.testing.assert_array_equal(ours.actions, theirs.actions)
+
+
+def test_hill_climbing_steps_from_the_trial_that_lasted_longest(system, shown, space):
+    run = learn(
+        system, shown, "hill-climbing", state=STATE, max_trials=6, stop_on_success=False, seed=2
+    )
+    vectors = [space.vector(p) for p in run.policies]
+    for k in range(1, 6):
+        best = max(range(k), key=lambda i: time_lasted(run.trials[i]))
+        rng = np.random.default_rng(np.random.SeedSequence(2, spawn_key=(k,)).spawn(2)[0])
+        np.testing.assert_allclose(
+            vectors[k], space.perturbed(vectors[best], 0.5, rng), rtol=1e-9, atol=1e-12
+        )
+
+
+def test_longer_balance_costs_less():
+    system = make_system("cartpole")
+    trial = demonstrate(system, "weak", n=1, seed=0)[0]
+    longer = replace(
+        trial,
+        observations=np.vstack([trial.observations[:1]] * 50 + [trial.observations]),
+        actions=np.vstack([trial.actions[:1]] * 50 + [trial.actions]),
+        costs=np.concatenate([np.full(50, trial.costs[0]), trial.costs]),
+        failure_step=trial.failure_step + 50,
+    )
+    assert total_cost(longer) < total_cost(trial)
+    with pytest.raises(MisstepError, match="needs the cost of each step"):
+        total_cost(replace(trial, costs=None))
+
+
+# Between the failures: the action is a speed along a stroke, s(p) = strength · (1 + p).
+
+
+def stroke(strength, who="d", outcome=Outcome.FAILURE):
+    p = np.linspace(0, 1, 41)
+    noise = 0.01 * np.random.default_rng(int(1000 * strength)).normal(size=(40, 1))
+    return Trajectory(
+        observations=p[:, None],
+        actions=strength * (1 + p[:-1, None]) + noise,
+        dt=0.005,
+        observation_columns=(Column("position", "m"),),
+        action_columns=(Column("velocity", "m/s"),),
+        provenance=Provenance("stroke", {}, who, None, ""),
+        outcome=outcome,
+    )
+
+
+TASK = Task(
+    (Column("position", "m"),),
+    (Column("velocity", "m/s"),),
+    np.array([0.0]),
+    np.array([10.0]),
+    ("position",),
+    0.005,
+)
+
+
+def strength_of(learner, shown, trials=(), seed=0, **parameters):
+    policy = LEARNERS[learner](**parameters).policy(
+        TASK, Evidence(tuple(shown), tuple(trials)), np.random.default_rng(seed)
+    )
+    return float(np.mean([policy(np.array([p]))[0] / (1 + p) for p in (0.1, 0.5, 0.9)]))
+
+
+def test_widest_gap_halves_it_and_goes_on_to_the_next():
+    shown = [stroke(s) for s in (1.0, 1.2, 2.4, 2.6)]
+    first = strength_of("widest-gap", shown)
+    assert first == pytest.approx(1.8, abs=0.05)
+    second = strength_of("widest-gap", shown, [stroke(first)])
+    assert second == pytest.approx(1.5, abs=0.05) or second == pytest.approx(2.1, abs=0.05)
+
+
+def test_widest_gap_does_not_count_a_success_as_a_failure():
+    shown = [stroke(s) for s in (1.0, 2.0)]
+    success = stroke(1.5, outcome=Outcome.SUCCESS)
+    assert strength_of("widest-gap", shown, [success]) == pytest.approx(1.5, abs=0.05)
+
+
+def test_balanced_mean_gives_every_demonstrator_one_say():
+    shown = [stroke(1.0, "a"), stroke(1.1, "a"), stroke(1.2, "a"), stroke(3.1, "b")]
+    assert strength_of("balanced-mean", shown) == pytest.approx(2.1, abs=0.05)
+    later = [strength_of("balanced-mean", shown, [stroke(2.1)], seed) for seed in range(20)]
+    assert np.std(later) > 0.1
+    assert min(later) >= 0.95
+    assert max(later) <= 3.15
+
+
+def test_random_scaling_scales_the_mean_after_the_first_trial():
+    shown = [stroke(1.0), stroke(2.0)]
+    assert strength_of("random-scaling", shown) == pytest.approx(1.5, abs=0.05)
+    factors = np.array(
+        [strength_of("random-scaling", shown, [stroke(1.5)], s, widest=1.5) for s in range(60)]
+    )
+    assert np.all((factors >= 0.97) & (factors <= 2.3))
+    assert np.std(np.log(factors)) == pytest.approx(np.log(1.5) / np.sqrt(3), rel=0.3)
+
+
+@pytest.mark.parametrize("learner", ["balanced-mean", "widest-gap", "random-scaling"])
+def test_a_blend_survives_a_file(learner):
+    shown = [stroke(s) for s in (1.0, 1.5, 2.5)]
+    kind = LEARNERS[learner]
+    policy = kind().policy(TASK, Evidence(tuple(shown), ()), np.random.default_rng(0))
+    again = kind.restore(TASK, policy.arrays())
+    for p in np.linspace(0, 1, 7):
+        np.testing.assert_array_equal(again(np.array([p])), policy(np.array([p])))
+
+
+def test_arrays_that_do_not_fit_are_refused():
+    with pytest.raises(MisstepError, match=r"has a bias \(1,\) and a gain \(1, 1\)"):
+        LinearPolicy.restore(TASK, {"bias": np.zeros(1), "gain": np.zeros((1, 3))})
+    with pytest.raises(MisstepError, match="must be finite"):
+        LinearPolicy.restore(TASK, {"bias": np.zeros(1), "gain": np.full((1, 1), np.nan)})
+    with pytest.raises(MisstepError, match="at least one finite share"):
+        LEARNERS["widest-gap"].restore(TASK, {"shares": np.zeros(0)})
