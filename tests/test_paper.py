@@ -173,7 +173,7 @@ def test_the_report_holds_every_figure_and_reaches_outside_for_nothing(whole):
     for number in range(1, 26):
         assert f"Figure {number}.</b>" in page
     assert len(re.findall(r'src="data:image/png;base64', page)) >= 28
-    assert len(re.findall(r'src="data:video/mp4;base64', page)) == 6
+    assert len(re.findall(r'src="data:video/mp4;base64', page)) == 7
     assert not re.search(r'(src|href)="(?!data:|#)', page)
     for name in figures.FIGURES:
         assert (whole / "figures" / f"{name}.png").stat().st_size > 5_000

@@ -15,7 +15,13 @@ from misstep.systems.basket_drawing import BasketScene, BasketSketch
 from misstep.systems.cartpole_drawing import CartPoleScene, CartPoleSketch
 from misstep.systems.flipup_drawing import FlipUpScene, FlipUpSketch
 from misstep.systems.offscreen import NoOpenGLError
-from misstep.systems.rendering import Painter, frames, n_frames, write_video
+from misstep.systems.rendering import (
+    Painter,
+    frames,
+    n_frames,
+    write_side_by_side,
+    write_video,
+)
 from misstep.trajectory import Column, Provenance, Trajectory
 
 SIZE = (320, 180)
@@ -328,3 +334,22 @@ def test_wrong_paths_are_told(trajectory, tmp_path):
         write_video(trajectory, tmp_path / "v.avi")
     with pytest.raises(MisstepError, match="No such file or directory"):
         write_video(trajectory, tmp_path / "nowhere" / "v.mp4", width=64, height=64)
+
+
+def test_side_by_side_holds_the_end_of_the_shorter(tmp_path):
+    system = CartPole(start_angle=0.3, start_spread=0.0)
+    push = demonstrate(system, "weak", n=1, seed=0)[0]
+    short = push.cut(max(1, push.n_steps // 3))
+    path = tmp_path / "both.mp4"
+    write_side_by_side(
+        [short, push], path, titles=["a", "b"], fps=10.0, width=160, height=90
+    )
+    reader = imageio_ffmpeg.read_frames(str(path))
+    meta = next(reader)
+    pictures = [np.frombuffer(frame, np.uint8).reshape(90, 320, 3).astype(int) for frame in reader]
+    assert meta["size"] == (320, 90)
+    assert len(pictures) == n_frames(push, 10.0)
+    left, right = pictures[-1][:, :160], pictures[-1][:, 160:]
+    held = pictures[n_frames(short, 10.0) - 1][:, :160]
+    assert np.abs(left - held).mean() < 3.0
+    assert np.abs(left - right).mean() > np.abs(left - held).mean()

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from misstep.errors import MisstepError
-from misstep.learners import Evidence, Task
+from misstep.learners import Evidence, Task, default_learner
 from misstep.parameters import ParameterValue
 from misstep.rollout import Policy, rollout
 from misstep.runs import Run, RunConfig
@@ -30,7 +30,7 @@ OnTrial = Callable[[Run], None]
 def learn(
     system: System,
     demonstrations: Dataset,
-    learner: str = "donut",
+    learner: str | None = None,
     *,
     state: Sequence[str] | None = None,
     max_trials: int = 20,
@@ -48,8 +48,8 @@ def learn(
         What to drive; one of the registry, so that the run can be resumed.
     demonstrations : Dataset
         Recorded on a system with the same columns and control period.
-    learner : str
-        Name in the registry of learners.
+    learner : str, optional
+        Name in the registry of learners; see `default_learner` for what is taken if left out.
     state : sequence of str, optional
         Observation columns that the policy may depend on; all of them if left out.
     max_trials : int
@@ -84,12 +84,15 @@ def learn(
         raise MisstepError(f"max_trials is {max_trials}: at least one trial is needed")
     if seed < 0:
         raise MisstepError(f"seed is {seed}: it must not be negative")
+    task = Task.of(system, state)
+    if learner is None:
+        learner = default_learner(task, demonstrations)[0]
     config = RunConfig(
         system=system.system_id,
         system_parameters=dict(system.parameters),
         learner=learner,
         learner_parameters=dict(learner_parameters),
-        state=Task.of(system, state).state,
+        state=task.state,
         seed=int(seed),
         max_trials=int(max_trials),
         stop_on_success=stop_on_success,

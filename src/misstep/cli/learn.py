@@ -42,8 +42,13 @@ def learn(
         typer.Option("--from", metavar="FILE", help="Failed demonstrations to start from."),
     ],
     learner: Annotated[
-        str, typer.Option(metavar="NAME", help="A learner of `misstep list learners`.")
-    ] = "donut",
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="A learner of `misstep list learners`.",
+            show_default="the highest rung whose feedback is there",
+        ),
+    ] = None,
     state: Annotated[
         str | None,
         typer.Option(
@@ -90,13 +95,19 @@ def learn(
     The exit code is 0 if a trial succeeded, or with --keep-going if all were made, and 1 otherwise.
     """
     import misstep
+    from misstep.learners import Task, default_learner
     from misstep.runs import CONFIG
 
     given = system_parameters(set_, success=success, failure=failure, cost=cost)
     parameters = parse_parameters("--with", with_)
-    misstep.LEARNERS[learner]  # an unknown name is told before anything is read
+    if learner is not None:
+        misstep.LEARNERS[learner]  # an unknown name is told before anything is read
     shown = misstep.load_dataset(demonstrations)
     driven = misstep.make_system(system, **_system_parameters(system, shown, given))
+    if learner is None:
+        task = Task.of(driven, parse_names(state))
+        learner, why = default_learner(task, shown)
+        print(f"learner {learner} ({why})")
     name = re.sub(r"[^\w.-]", "-", f"{system}-{learner}-{seed}")  # gym:space/Robot-v1
     folder = Path("runs") / name if out is None else out
     check_output_file(json, "--json")

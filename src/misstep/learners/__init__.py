@@ -1,6 +1,7 @@
 """Strategies that turn failed attempts into the next policy: one strategy a file, one registry."""
 
 from misstep.learners.between import BalancedMean, RandomScaling, WidestGap
+from misstep.learners.choice import default_learner
 from misstep.learners.donut import DonutLearner, DonutPolicy
 from misstep.learners.donut_cost import DonutCostLearner
 from misstep.learners.donut_incremental import DonutIncremental
@@ -38,4 +39,5 @@ __all__ = [
     "Segments",
     "Task",
     "WidestGap",
+    "default_learner",
 ]

@@ -3,7 +3,7 @@
 Near an unstable state everything grows like e^{ωt}, so where an attempt will end can be read off
 the state long before it ends, and the discounted failure is linear in the state. Four steps, each a
 small regression on x = (s − s₀)/σ (s₀ the mean first state, σ over all states) and on the action a
-in units of its limit:
+in units of the largest that was used:
 
 1. *Ways to fail.* Failures whose ends lie along one line through s₀ are one way to fail (the pole
    falls over); those that do not are another (the cart reaches the end of the rail).
@@ -115,6 +115,9 @@ class Fall:
         steady = len(evidence.trials) < self.steady_trials
         weights = np.ones(len(cut)) if steady else rng.exponential(size=len(cut))
         centre, half = _limits(task)
+        # A limit that nobody comes near is no measure of an action.
+        used = np.concatenate([np.abs(t.actions - centre) for t in cut]).max(axis=0)
+        half = np.minimum(half, used)
         attempts = [
             Scaled((t.select(task.state) - origin) / spread, (t.actions - centre) / half, f, w)
             for t, f, w in zip(cut, failed, weights, strict=True)

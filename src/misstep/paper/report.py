@@ -20,6 +20,7 @@ def render(
     results: Results,
     figures: Path,
     videos: Sequence[Video],
+    sequel_video: Path,
 ) -> str:
     """Return the page.
 
@@ -32,6 +33,7 @@ def render(
     figures : Path
         Folder of the PNG files.
     videos : sequence of Video
+    sequel_video : Path
     """
     shown = results.demonstration_costs("without-reward")
     explored = results.costs("without-reward")
@@ -41,6 +43,7 @@ def render(
         claims=claims,
         verdicts=Counter(claim.verdict for claim in claims).most_common(),
         figure=lambda name: data_url(figures / f"{name}.png"),
+        sequel_video=data_url(sequel_video),
         videos=[
             (data_url(v.path), f"{v.title}: {v.trajectory.mean_cost:.0f}° over 30 s")
             for v in videos

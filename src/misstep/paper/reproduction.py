@@ -28,6 +28,7 @@ from misstep.paper.claims import Sample, judge_all
 from misstep.paper.experiments import VARIANTS, Variant, run_cell
 from misstep.paper.measures import CellMeasures, measure
 from misstep.paper.results import SHOWN_RUNS, Results, collect_calibration
+from misstep.paper.sequel import keep_sequel, summary, write_sequel_video
 from misstep.paper.synthetic import SyntheticMeasures, run_synthetic, synthetic_measures
 from misstep.paper.videos import VIDEOS, Video, choose_videos, write_video_once
 from misstep.runs import load_run, make_folder, read_json
@@ -38,6 +39,7 @@ from misstep.workers import Progress, Tally, check_workers, process_pool, silent
 Array = NDArray[np.float64]
 
 CONFIG = "reproduce.json"
+SEQUEL = "sequel"
 SEEDS = 30
 QUICK_SEEDS = 5
 
@@ -135,14 +137,16 @@ def resume(out: Path, *, workers: int | None = None, progress: Progress | None =
 
 def _run(out: Path, config: ReproductionConfig, workers: int, progress: Progress) -> Path:
     missing = [cell for cell in config.cells if not _cell_file(out, *cell).exists()]
-    tally = Tally(progress, total=len(config.cells) + len(figures.FIGURES) + VIDEOS + 1)
+    tally = Tally(progress, total=len(config.cells) + len(figures.FIGURES) + VIDEOS + 2)
     tally.done = len(config.cells) - len(missing)
     with process_pool(workers) as pool:
         calibrations, synthetic = _measure_apart(config, pool)
+        sequel = pool.submit(keep_sequel, out / "runs" / SEQUEL, config.seed)
         run = partial(_run_and_measure, out, config)
         for name, index in missing:
             tally.expect(pool.submit(run, name, index), f"{VARIANTS[name].title}, seed {index + 1}")
         tally.wait()
+        sequel.result()
         results = _gather(out, config, calibrations.result(), synthetic.result())
         make_folder(out / "figures")
         make_folder(out / "videos")
@@ -150,6 +154,8 @@ def _run(out: Path, config: ReproductionConfig, workers: int, progress: Progress
         videos = choose_videos(out / "videos", results)
         for video in videos:
             tally.expect(pool.submit(write_video_once, video), video.title)
+        path = out / "videos" / f"{SEQUEL}.mp4"
+        tally.expect(pool.submit(write_sequel_video, path, results.sequel), "the sequel's video")
         for name in figures.FIGURES:
             tally.expect(pool.submit(figures.draw, name, out / "figures", results), name)
         tally.wait()
@@ -179,9 +185,12 @@ def _write_results(
         "calibrations": tables.calibrations(results),
         "tables": tables.all_tables(results),
         "claims": [claim.to_json() for claim in claims],
+        "sequel": summary(results.sequel),
     }
     write_json(out / "tables.json", document)
-    page = report.render(document, claims, results, out / "figures", videos)
+    page = report.render(
+        document, claims, results, out / "figures", videos, out / "videos" / f"{SEQUEL}.mp4"
+    )
     write_text(out / "report.html", page)
     shutil.rmtree(out / "work", ignore_errors=True)
 
@@ -222,6 +231,7 @@ def _gather(
         synthetic=run_synthetic(config.seed),
         synthetic_measures=synthetic,
         calibrations=calibrations,
+        sequel=load_run(out / "runs" / SEQUEL),
     )
 
 

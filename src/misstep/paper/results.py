@@ -31,6 +31,8 @@ class Results:
     synthetic_measures: list[SyntheticMeasures]
     calibrations: dict[str, NDArray[np.float64]]
     """Costs of many demonstrations of each calibration, shape (N, 3), deg."""
+    sequel: Run
+    """Four failures and what solves them, see `misstep.paper.sequel`."""
 
     def costs(self, variant: str) -> NDArray[np.float64]:
         """Return the exploration costs of all seeds, shape (seeds, E, 3), deg."""

@@ -9,7 +9,7 @@ from misstep.systems.rendering import write_video
 from misstep.trajectory import Trajectory
 
 VIDEOS = DEMONSTRATIONS + 2
-WIDTH, HEIGHT, FPS = 480, 270, 15.0
+WIDTH, HEIGHT, FPS = 480, 270, 12.0
 
 
 class Video(NamedTuple):

@@ -9,7 +9,8 @@ import functools
 import math
 import os
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol
@@ -264,6 +265,52 @@ def write_video(
         raise MisstepError(f"cannot write {path}: a video is an MP4 file, name it NAME.mp4")
     pictures = frames(trajectory, fps, width, height, title)
     atomic_write(path, lambda temporary: _encode(pictures, temporary, fps, (width, height)))
+
+
+def write_side_by_side(
+    trajectories: Sequence[Trajectory],
+    path: str | os.PathLike[str],
+    *,
+    titles: Sequence[str],
+    fps: float = 20.0,
+    width: int = 640,
+    height: int = 360,
+) -> None:
+    """Write trajectories into one video, beside each other; the shorter ones hold their end.
+
+    Parameters
+    ----------
+    trajectories : sequence of Trajectory
+        As for `frames`.
+    path : path
+        Ends in ``.mp4``.
+    titles : sequence of str
+        One each.
+    fps : float, 1/s
+    width, height : int, px
+        Of each.
+
+    Raises
+    ------
+    MisstepError
+        As `write_video`.
+    """
+    if Path(path).suffix.lower() != ".mp4":
+        raise MisstepError(f"cannot write {path}: a video is an MP4 file, name it NAME.mp4")
+    sides = [
+        frames(trajectory, fps, width, height, title)
+        for trajectory, title in zip(trajectories, titles, strict=True)
+    ]
+    size = (width * len(sides), height)
+    atomic_write(path, lambda temporary: _encode(_beside(sides), temporary, fps, size))
+
+
+def _beside(sides: Sequence[Iterator[NDArray[np.uint8]]]) -> Iterator[NDArray[np.uint8]]:
+    """Join the pictures of all sides until the last has ended."""
+    shown: list[NDArray[np.uint8]] = []
+    for pictures in zip_longest(*sides):
+        shown = [new if new is not None else shown[k] for k, new in enumerate(pictures)]
+        yield np.concatenate(shown, axis=1)
 
 
 def _check_drawn(system: str) -> type[Drawing]:
