@@ -50,7 +50,8 @@ def test_an_action_limit_that_nobody_comes_near_changes_nothing():
     near, far = (make_system("cartpole", force_limit=limit) for limit in (40.0, 4000.0))
     shown = demonstrate(near, "weak", seed=3)
     other = demonstrate(far, "weak", seed=3)
-    assert Dataset([replace(t, provenance=o.provenance) for t, o in zip(shown, other, strict=True)]) == other
+    pairs = zip(shown, other, strict=True)
+    assert Dataset([replace(t, provenance=o.provenance) for t, o in pairs]) == other
     first, second = (
         learn(s, d, "fall", state=("theta", "theta_dot"), seed=0, max_trials=1)
         for s, d in ((near, shown), (far, other))
