@@ -34,7 +34,7 @@ def em_step(X, sample_weight, weights, means, covariances, floor):
 
 
 def condition(state, weights, means, covariances):
-    """h_k, m_k, S_k of the actions given the leading columns `state` (DESIGN: conditioning)."""
+    """h_k, m_k, S_k of the actions given the leading columns `state`; see `conditional`."""
     n = len(state)
     x, a = slice(0, n), slice(n, None)
     log_h = log_joint(state[None, :], weights, means[:, x], covariances[:, x, x])[0]
