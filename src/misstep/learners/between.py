@@ -15,14 +15,17 @@ from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
 from misstep.learners.learner import LEARNERS, Evidence, Task, joint_samples
-from misstep.learners.mixtures import MixtureParameters, MixturePolicy
+from misstep.learners.mixtures import (
+    MixtureParameters,
+    MixturePolicy,
+    mixture_arrays,
+    restore_mixture,
+)
 from misstep.mixture import GaussianMixture
 from misstep.parameters import check_parameters, parameter
 from misstep.trajectory import Outcome, Trajectory
 
 Array = NDArray[np.float64]
-
-_PARTS = ("weights", "means", "covariances")
 
 
 class BlendPolicy:
@@ -55,8 +58,7 @@ class BlendPolicy:
         """Return the shares and each mixture's parameters."""
         arrays = {"shares": self.shares}
         for index, part in enumerate(self._parts):
-            for name, value in part.arrays().items():
-                arrays[f"{name}_{index}"] = value
+            arrays |= mixture_arrays(part.mixture, f"{{}}_{index}")
         return arrays
 
     @classmethod
@@ -65,10 +67,7 @@ class BlendPolicy:
         shares = arrays["shares"]
         if shares.ndim != 1 or not len(shares) or not np.all(np.isfinite(shares)):
             raise MisstepError(f"a blend takes at least one finite share, got {shares}")
-        mixtures = [
-            GaussianMixture.from_parameters(*(arrays[f"{part}_{index}"] for part in _PARTS))
-            for index in range(len(shares))
-        ]
+        mixtures = [restore_mixture(arrays, f"{{}}_{index}") for index in range(len(shares))]
         return cls(task, mixtures, shares)
 
 

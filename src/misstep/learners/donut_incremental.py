@@ -17,7 +17,12 @@ from scipy.stats import rankdata
 from misstep.errors import MisstepError
 from misstep.learners.donut import SCALE_SHARE
 from misstep.learners.learner import LEARNERS, Evidence, Task, joint_samples
-from misstep.learners.mixtures import MixtureParameters, MixturePolicy, restore_mixture
+from misstep.learners.mixtures import (
+    MixtureParameters,
+    MixturePolicy,
+    mixture_arrays,
+    restore_mixture,
+)
 from misstep.mixture import Conditioner, DonutMixture, GaussianMixture, exploration_from_variance
 from misstep.parameters import check_parameters, parameter
 from misstep.trajectory import Trajectory
@@ -66,11 +71,7 @@ class IncrementalPolicy(MixturePolicy):
 
     def arrays(self) -> dict[str, Array]:
         """Return both mixtures and s."""
-        merit = {
-            "merit_weights": self.merit.weights_,
-            "merit_means": self.merit.means_,
-            "merit_covariances": self.merit.covariances_,
-        }
+        merit = mixture_arrays(self.merit, "merit_{}")
         return {**super().arrays(), **merit, "scale": self.scale}
 
 
@@ -102,8 +103,7 @@ class DonutIncremental(MixtureParameters):
     @staticmethod
     def restore(task: Task, arrays: Mapping[str, Array]) -> IncrementalPolicy:
         """Return the policy that `IncrementalPolicy.arrays` described."""
-        names = ("weights", "means", "covariances")
-        merit = restore_mixture({name: arrays[f"merit_{name}"] for name in names})
+        merit = restore_mixture(arrays, "merit_{}")
         return IncrementalPolicy(task, restore_mixture(arrays), merit, arrays["scale"])
 
 

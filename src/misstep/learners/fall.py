@@ -25,7 +25,7 @@ the next trial differs. Attempts that did not fail tell what the action does, bu
 would have ended, and are left out of steps 1 and 2.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
 from misstep.learners.learner import LEARNERS, Evidence, Task, joint_samples
-from misstep.learners.linear import LinearPolicy
+from misstep.learners.linear import LinearLearner, LinearPolicy
 from misstep.parameters import check_parameters, parameter
 from misstep.trajectory import Trajectory
 
@@ -87,7 +87,7 @@ class Response(NamedTuple):
 
 @LEARNERS.register("fall")
 @dataclass(frozen=True)
-class Fall:
+class Fall(LinearLearner):
     """Rung 2: learns what a fall looks like from when attempts failed, and pushes against it."""
 
     horizon: float = parameter(
@@ -129,11 +129,6 @@ class Fall:
         return LinearPolicy(
             task, centre + half * (rows[:, 0] - gain @ origin), half[:, None] * gain
         )
-
-    @staticmethod
-    def restore(task: Task, arrays: Mapping[str, Array]) -> LinearPolicy:
-        """Return the policy that `LinearPolicy.arrays` described."""
-        return LinearPolicy.restore(task, arrays)
 
 
 def ways_to_fail(attempts: Sequence[Scaled], n_demonstrations: int) -> list[list[Scaled]]:

@@ -95,6 +95,11 @@ class Task:
         names = [column.name for column in self.observation_columns]
         return np.array([names.index(name) for name in self.state], dtype=np.intp)
 
+    def clipped(self, action: Array) -> Array:
+        """Return an action (m,) inside the actuator's limits."""
+        limited: Array = np.minimum(np.maximum(action, self.action_low), self.action_high)
+        return limited
+
     def joint(self, trajectory: Trajectory) -> Array:
         """Return the (state, action) pairs of a trajectory, shape (T, n + m)."""
         return np.concatenate([trajectory.select(self.state)[:-1], trajectory.actions], axis=1)
@@ -177,9 +182,11 @@ LEARNERS: Registry[type[Learner]] = Registry("learner", "misstep.learners")
 
 
 def _seen_from(rung: int, trajectory: Trajectory) -> Trajectory:
+    if rung >= 3:
+        return trajectory
     return replace(
         trajectory,
         outcome=trajectory.outcome if rung >= 1 else Outcome.UNKNOWN,
         failure_step=trajectory.failure_step if rung >= 2 else None,
-        costs=trajectory.costs if rung >= 3 else None,
+        costs=None,
     )

@@ -43,9 +43,7 @@ class LinearPolicy:
 
     def __call__(self, observation: Array, /) -> Array:
         """Return the action at an observation, inside the actuator's limits."""
-        action = self.bias + self.gain @ observation[self._indices]
-        limited: Array = np.minimum(np.maximum(action, self.task.action_low), self.task.action_high)
-        return limited
+        return self.task.clipped(self.bias + self.gain @ observation[self._indices])
 
     def arrays(self) -> dict[str, Array]:
         """Return the bias and the gain."""
@@ -132,9 +130,18 @@ class LinearSpace:
         return rows.ravel()
 
 
+class LinearLearner:
+    """What the learners of linear policies share: how such a policy comes back from a file."""
+
+    @staticmethod
+    def restore(task: Task, arrays: Mapping[str, Array]) -> LinearPolicy:
+        """Return the policy that `LinearPolicy.arrays` described."""
+        return LinearPolicy.restore(task, arrays)
+
+
 @LEARNERS.register("random-linear")
 @dataclass(frozen=True)
-class RandomLinear:
+class RandomLinear(LinearLearner):
     """Rung 1: random linear policies until one succeeds; learns nothing."""
 
     size: float = parameter(
@@ -151,15 +158,10 @@ class RandomLinear:
         space = LinearSpace(task, evidence.demonstrations)
         return space.policy(space.perturbed(space.idle(), self.size, rng))
 
-    @staticmethod
-    def restore(task: Task, arrays: Mapping[str, Array]) -> LinearPolicy:
-        """Return the policy that `LinearPolicy.arrays` described."""
-        return LinearPolicy.restore(task, arrays)
-
 
 @LEARNERS.register("hill-climbing")
 @dataclass(frozen=True)
-class HillClimbing:
+class HillClimbing(LinearLearner):
     """Rung 2: perturbs the linear policy that lasted longest before it failed."""
 
     size: float = parameter(
@@ -179,11 +181,6 @@ class HillClimbing:
         best = max(range(len(evidence.trials)), key=lambda i: time_lasted(evidence.trials[i]))
         vector = space.vector(evidence.policies[best])  # type: ignore[arg-type]
         return space.policy(space.perturbed(vector, self.size, rng))
-
-    @staticmethod
-    def restore(task: Task, arrays: Mapping[str, Array]) -> LinearPolicy:
-        """Return the policy that `LinearPolicy.arrays` described."""
-        return LinearPolicy.restore(task, arrays)
 
 
 def time_lasted(trial: Trajectory) -> float:

@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 # limit would otherwise grow components without width.
 COVARIANCE_FLOOR = 2.5e-5
 
+_PARTS = ("weights", "means", "covariances")
+
 
 @dataclass(frozen=True)
 class MixtureParameters:
@@ -72,11 +74,7 @@ class MixturePolicy:
 
     def arrays(self) -> dict[str, Array]:
         """Return the mixture's parameters."""
-        return {
-            "weights": self.mixture.weights_,
-            "means": self.mixture.means_,
-            "covariances": self.mixture.covariances_,
-        }
+        return mixture_arrays(self.mixture)
 
     def state_of(self, observation: Array) -> Array:
         """Return the state's columns of an observation, shape (n,)."""
@@ -85,12 +83,15 @@ class MixturePolicy:
 
     def clipped(self, action: Array) -> Array:
         """Return the action inside the actuator's limits."""
-        limited: Array = np.minimum(np.maximum(action, self.task.action_low), self.task.action_high)
-        return limited
+        return self.task.clipped(action)
 
 
-def restore_mixture(arrays: Mapping[str, Array]) -> GaussianMixture:
-    """Return the mixture that `MixturePolicy.arrays` described."""
-    return GaussianMixture.from_parameters(
-        arrays["weights"], arrays["means"], arrays["covariances"]
-    )
+def mixture_arrays(mixture: GaussianMixture, key: str = "{}") -> dict[str, Array]:
+    """Return a mixture's parameters; `key` names them, for policies that hold several mixtures."""
+    values = (mixture.weights_, mixture.means_, mixture.covariances_)
+    return {key.format(part): value for part, value in zip(_PARTS, values, strict=True)}
+
+
+def restore_mixture(arrays: Mapping[str, Array], key: str = "{}") -> GaussianMixture:
+    """Return the mixture that `mixture_arrays` described."""
+    return GaussianMixture.from_parameters(*(arrays[key.format(part)] for part in _PARTS))

@@ -4,7 +4,7 @@ Both are given what the paper's related work gives them, a cost, and both start 
 average of the failed demonstrations.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
 from misstep.learners.learner import LEARNERS, Evidence, Task
-from misstep.learners.linear import LinearPolicy, LinearSpace
+from misstep.learners.linear import LinearLearner, LinearPolicy, LinearSpace
 from misstep.parameters import check_parameters, parameter
 from misstep.trajectory import Trajectory
 
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 @LEARNERS.register("cma-es")
 @dataclass(frozen=True)
-class CmaEs:
+class CmaEs(LinearLearner):
     """Rung 3: CMA-ES on the gains of a linear policy, from the demonstrations' average."""
 
     size: float = parameter(
@@ -50,15 +50,10 @@ class CmaEs:
             candidates = search.ask()
         return space.policy(np.asarray(candidates[len(losses)]))
 
-    @staticmethod
-    def restore(task: Task, arrays: Mapping[str, Array]) -> LinearPolicy:
-        """Return the policy that `LinearPolicy.arrays` described."""
-        return LinearPolicy.restore(task, arrays)
-
 
 @LEARNERS.register("power")
 @dataclass(frozen=True)
-class Power:
+class Power(LinearLearner):
     """Rung 3: PoWER (the paper's reference [3]): average the best trials, perturb the average.
 
     The demonstrations are its first data: the search starts from their average, weighted by
@@ -92,11 +87,6 @@ class Power:
         chosen = np.argsort(-own, kind="stable")[: self.best]
         mean = np.average(vectors[chosen], axis=0, weights=own[chosen])
         return space.policy(space.perturbed(mean, self.size, rng))
-
-    @staticmethod
-    def restore(task: Task, arrays: Mapping[str, Array]) -> LinearPolicy:
-        """Return the policy that `LinearPolicy.arrays` described."""
-        return LinearPolicy.restore(task, arrays)
 
 
 def total_cost(attempt: Trajectory) -> float:

@@ -21,7 +21,12 @@ from numpy.typing import NDArray
 from misstep.errors import MisstepError
 from misstep.learners.donut import SCALE_SHARE
 from misstep.learners.learner import LEARNERS, Evidence, Task, joint_samples
-from misstep.learners.mixtures import MixtureParameters, MixturePolicy, restore_mixture
+from misstep.learners.mixtures import (
+    MixtureParameters,
+    MixturePolicy,
+    mixture_arrays,
+    restore_mixture,
+)
 from misstep.mixture import DonutMixture, GaussianMixture, exploration_from_variance
 from misstep.parameters import check_parameters, parameter
 from misstep.trajectory import Trajectory
@@ -76,7 +81,7 @@ class SegmentsPolicy(MixturePolicy):
 
     def arrays(self) -> dict[str, Array]:
         """Return both mixtures, s and β."""
-        bad = {f"bad_{name}": value for name, value in self.bad.arrays().items()}
+        bad = mixture_arrays(self.bad.mixture, "bad_{}")
         own = {"scale": self.scale, "repulsion": np.array(self.repulsion)}
         return {**super().arrays(), **bad, **own}
 
@@ -124,11 +129,10 @@ class Segments(MixtureParameters):
     @staticmethod
     def restore(task: Task, arrays: Mapping[str, Array]) -> SegmentsPolicy:
         """Return the policy that `SegmentsPolicy.arrays` described."""
-        bad = {name: arrays[f"bad_{name}"] for name in ("weights", "means", "covariances")}
         return SegmentsPolicy(
             task,
             restore_mixture(arrays),
-            restore_mixture(bad),
+            restore_mixture(arrays, "bad_{}"),
             arrays["scale"],
             float(arrays["repulsion"]),
         )
