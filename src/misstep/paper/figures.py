@@ -69,14 +69,16 @@ def _overview(results: Results) -> Figure:
         axes.set_axis_off()
         if index == 0:
             axes.set_title("a demonstration that fails")
-    titles = ("the mixture of four failures", "the donut at 170°", "what is tried after ten trials")
+    titles = (
+        "the mixture of four failures",
+        "a donut: made-up data, 90°",
+        "what is tried after ten trials",
+    )
     panels = [figure.add_subplot(grid[1, 4 * i : 4 * i + 4]) for i in range(3)]
     for axes, title in zip(panels, titles, strict=True):
         axes.set_title(title)
     _draw_exploration(panels[0], run, 1)
-    policy = run.policies[5]
-    donut = policy.donut_at([np.radians(170.0)])  # type: ignore[attr-defined]
-    _draw_donut(panels[1], donut)
+    _draw_donut(panels[1], results.synthetic.policies[0].donut_at([90.0]))
     _draw_exploration(panels[2], run, EXPLORATIONS)
     return figure
 
