@@ -54,6 +54,7 @@ provenances = st.builds(
     texts,
     st.none() | st.integers(0, 2**128 - 1),
     st.just("") | st.datetimes().map(lambda t: t.isoformat()),
+    st.lists(texts, max_size=3).map(tuple),
 )
 
 

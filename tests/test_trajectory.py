@@ -1,5 +1,6 @@
 import copy
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -96,6 +97,7 @@ def test_copies_are_equal_and_still_read_only(duplicate):
         {"observation_columns": (Column("theta", "deg"), THETA[1])},
         {"action_columns": (Column("torque", "N"),)},
         {"provenance": Provenance("cartpole", {}, "noisy", 7, "")},
+        {"provenance": replace(PROVENANCE, notes=("actions: inferred",))},
         {"outcome": Outcome.SUCCESS},
         {"costs": np.zeros(3)},
         {"failure_step": 0},
@@ -198,6 +200,8 @@ def test_bad_columns_are_refused(name, unit):
         ({"parameters": {"a": 2**63}}, "int of 64 bits"),
         ({"parameters": {"a": "x\n"}}, "printable"),
         ({"parameters": {1: 1}}, "the name of a parameter is 1"),
+        ({"notes": "actions inferred"}, "notes is 'actions inferred': it lists texts"),
+        ({"notes": ["two\nlines"]}, "a note of a provenance is"),
     ],
 )
 def test_bad_provenance_is_refused(changes, line):

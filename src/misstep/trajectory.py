@@ -77,6 +77,9 @@ class Provenance:
         Seed of the episode, 0 <= seed < 2**128, if it had one.
     time : str
         When it was recorded, ISO 8601, or empty.
+    notes : tuple of str
+        What was not recorded but inferred or changed since, a line each: ``"actions: inferred by
+        inverse dynamics of cartpole"``. Empty for what is just as it was recorded.
 
     Raises
     ------
@@ -90,10 +93,12 @@ class Provenance:
     demonstrator: str
     seed: int | None
     time: str
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         _check_text(self.system, "the system of a provenance")
         _check_text(self.demonstrator, "the demonstrator of a provenance")
+        object.__setattr__(self, "notes", _notes(self.notes))
         _check_time(self.time)
         if not isinstance(self.parameters, Mapping):
             raise MisstepError(f"parameters is {self.parameters!r}: it maps names to values")
@@ -113,6 +118,7 @@ class Provenance:
             self.demonstrator,
             self.seed,
             self.time,
+            self.notes,
         )
 
 
@@ -361,6 +367,15 @@ def _check_text(text: object, what: str) -> None:
     # neither a table on a terminal nor a file could hold.
     if not isinstance(text, str) or not text.isprintable():
         raise MisstepError(f"{what} is {text!r}: it has to be printable text on one line")
+
+
+def _notes(notes: object) -> tuple[str, ...]:
+    if isinstance(notes, str) or not isinstance(notes, Iterable):
+        raise MisstepError(f"notes is {notes!r}: it lists texts")
+    listed = tuple(notes)
+    for note in listed:
+        _check_text(note, "a note of a provenance")
+    return listed
 
 
 def _check_time(time: object) -> None:

@@ -5,7 +5,8 @@
     /            attributes misstep_format, dt, observation_columns, action_columns (JSON lists
                  of [name, unit]), total_episodes, total_steps
     /episode_0   attributes id, total_steps, seed (if any), system, parameters (JSON),
-                 demonstrator, time, outcome, failure_step (if any), costs_recorded
+                 demonstrator, time, notes (JSON list, if any), outcome, failure_step (if
+                 any), costs_recorded
       observations (T + 1, n) float64    terminations (T,) bool
       actions      (T, m)     float64    truncations  (T,) bool
       rewards      (T,)       float64    infos        an empty group
@@ -198,6 +199,8 @@ def _episode_attributes(index: int, trajectory: Trajectory) -> dict[str, Any]:
     }
     if trajectory.failure_step is not None:
         attributes["failure_step"] = trajectory.failure_step
+    if provenance.notes:
+        attributes["notes"] = json.dumps(provenance.notes)
     if provenance.seed is not None:
         # Minari reads a seed as int(seed): beyond 64 bits, which HDF5 lacks, digits do as well.
         seed = provenance.seed
@@ -363,6 +366,7 @@ def _read_provenance(group: h5py.Group) -> Provenance:
         demonstrator=_attribute(group, "demonstrator", str),
         seed=seed,
         time=_attribute(group, "time", str),
+        notes=_json(group, "notes") if _has(group, "notes") else (),
     )
 
 
