@@ -15,8 +15,11 @@ from misstep.learners.fall import (
     cascade,
     learn_danger,
     respond,
+    shares_of_the_usual,
     ways_to_fail,
 )
+from misstep.learners.learner import LEARNERS, Evidence, Task
+from misstep.learners.linear import LinearPolicy
 
 STATE = ("theta", "theta_dot")
 DT = 0.02
@@ -80,6 +83,34 @@ def test_attempts_that_did_not_fail_say_nothing_of_the_danger():
     grouped = ways_to_fail(with_more, n_demonstrations=4)
     assert len(grouped) == 1
     assert [id(a) for a in grouped[0]] == [id(a) for a in failures]
+
+
+def test_an_attempt_counts_by_how_long_it_lasted_but_never_more_than_a_demonstration():
+    whole = demonstrate(make_system("cartpole"), "weak", seed=0)[0]
+    lasting = [whole.cut(n) for n in (10, 20, 30, 5, 40)]
+    shares = shares_of_the_usual(lasting, n_demonstrations=3)
+    assert shares == pytest.approx([0.5, 1.0, 1.0, 0.25, 1.0])
+
+
+def test_later_trials_differ_and_half_of_them_keep_half_of_the_longest_lasting():
+    system = make_system("cartpole")
+    task, shown = Task.of(system, STATE), demonstrate(system, "weak", n=8, seed=1)
+    demonstrations, trials = tuple(shown[:4]), tuple(shown[4:])
+    best = max(range(4), key=lambda i: trials[i].duration)
+    # Gains that no learner would find by itself, to be seen again.
+    policies = tuple(LinearPolicy(task, np.zeros(1), np.full((1, 2), 1e6 + i)) for i in range(4))
+    evidence = Evidence(demonstrations, trials, policies)
+    fall = LEARNERS["fall"]()
+    gains = [fall.policy(task, evidence, np.random.default_rng(i)).gain[0] for i in range(30)]
+    kept = [gain for gain in gains if gain[0] > 1e5]
+    assert 8 <= len(kept) <= 22
+    assert len({gain.tobytes() for gain in gains}) == 30
+    own = np.median([gain for gain in gains if gain[0] < 1e5], axis=0)
+    assert np.median(kept, axis=0) == pytest.approx(0.5 * (1e6 + best + own), abs=20)
+    steady = LEARNERS["fall"](steady_trials=5)
+    same = [steady.policy(task, evidence, np.random.default_rng(i)).gain for i in range(3)]
+    assert np.array_equal(same[0], same[1])
+    assert np.array_equal(same[0], same[2])
 
 
 def test_ways_to_fail_are_the_lines_along_which_attempts_ended():

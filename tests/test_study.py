@@ -25,6 +25,7 @@ from misstep.study import load_study, run_study
 from misstep.study.cells import CellResult, cell_file, run_cell
 from misstep.study.figures import learning_curve
 from misstep.study.page import rate_colour
+from misstep.study.run import held_study
 from misstep.study.table import TIMING, Quantile, censored_quantile
 
 needs_ray = pytest.mark.skipif(
@@ -377,9 +378,30 @@ def test_one_worker_killed_and_resumed_gives_the_same_tables(whole, tmp_path):
     finished = {path: path.stat().st_mtime_ns for path in out.glob("cells/*/*/*/*.json")}
     assert 0 < len(finished) < 10
     assert not (out / "cells.csv").exists()
-    run_study(load_study(spec), out, workers=2)
+    assert main(["resume", str(out)]) == 0
     assert tables(out) == tables(whole)
     assert {path: path.stat().st_mtime_ns for path in finished} == finished
+
+
+def test_a_folder_remembers_its_whole_study(whole, spec):
+    assert held_study(whole) == load_study(spec)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda values: values.pop("study"), "study.json is damaged: it describes no study"),
+        (lambda values: values["study"].pop("cases"), "damaged: .*'cases'"),
+        (lambda values: values["study"]["cases"][0].pop("seeds"), "damaged: .*seeds"),
+        (lambda values: values.update(version="0.0.0"), "a study of misstep 0.0.0, but this is"),
+    ],
+)
+def test_a_damaged_or_older_study_is_not_resumed(whole, tmp_path, refused, change, match):
+    values = json.loads((whole / "study.json").read_text())
+    change(values)
+    (tmp_path / "study.json").write_text(json.dumps(values))
+    with refused(match):
+        held_study(tmp_path)
 
 
 def test_another_study_in_the_same_folder_is_refused(whole, spec, tmp_path, refused):

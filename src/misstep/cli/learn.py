@@ -32,7 +32,7 @@ from misstep.parameters import ParameterValue
 if TYPE_CHECKING:
     from misstep import Dataset, Run
 
-_REPRODUCTION = "reproduce.json"
+_REPRODUCTION, _STUDY = "reproduce.json", "study.json"
 
 
 def learn(
@@ -132,7 +132,7 @@ def resume(
     folder: Annotated[
         Path,
         typer.Argument(
-            metavar="FOLDER", help="Of `misstep learn --out` or `misstep reproduce --out`."
+            metavar="FOLDER", help="Of `misstep learn`, `misstep reproduce` or `misstep study`."
         ),
     ],
     json: JsonFile = None,
@@ -149,6 +149,10 @@ def resume(
         from misstep.cli.reproduce import resume_reproduction
 
         return resume_reproduction(folder, json)
+    if (folder / _STUDY).exists():
+        from misstep.cli.study import resume_study
+
+        return resume_study(folder, json)
     run = misstep.load_run(folder)
     with progress("trial") as report, resumable(folder, CONFIG):
         report(len(run.trials), run.config.max_trials, "")

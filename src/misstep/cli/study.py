@@ -1,15 +1,17 @@
 """``misstep study``: many runs, one table, one page."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from misstep.cli.interruption import resumable
 from misstep.cli.options import JsonFile
 from misstep.cli.output import check_output_file, print_table, write_result
 from misstep.cli.progress import progress
 
 if TYPE_CHECKING:
+    from misstep.study import Study
     from misstep.study.run import Report
     from misstep.study.table import Quantile, Rate, Summary
 
@@ -44,20 +46,26 @@ def study(
     If the folder holds the same study, unfinished, that one goes on. The exit code is 0 if every
     run went through, whether a trial succeeded or not, and 1 if one ended in an error or was lost.
     """
-    from misstep.study import load_study, run_study
-    from misstep.study.run import CONFIG
+    from misstep.study import load_study
 
     check_output_file(json, "--json")
     wanted = load_study(spec).quick() if quick else load_study(spec)
-    try:
-        with progress("studying") as report:
-            done = run_study(
-                wanted, out, engine=engine, workers=workers, address=address, progress=report
-            )
-    except KeyboardInterrupt as interrupt:
-        if (out / CONFIG).exists():
-            raise KeyboardInterrupt("the same command goes on") from interrupt
-        raise
+    return _run(wanted, out, json, engine=engine, workers=workers, address=address)
+
+
+def resume_study(folder: Path, json: Path | None) -> int:
+    """Go on with the study in a folder, on processes, one a core."""
+    from misstep.study.run import held_study
+
+    return _run(held_study(folder), folder, json)
+
+
+def _run(wanted: "Study", out: Path, json: Path | None, **how: Any) -> int:
+    from misstep.study import run_study
+    from misstep.study.run import CONFIG
+
+    with progress("studying") as report, resumable(out, CONFIG):
+        done = run_study(wanted, out, progress=report, **how)
     return _conclude(done, json)
 
 

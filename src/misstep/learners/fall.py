@@ -20,9 +20,11 @@ With two dangers the fast one is what the slow one acts through: over a second, 
 leaning the pole. Step 3 then takes the fast danger for the action of the slow one, and step 4 gives
 the r that the fast danger is to be kept at. The result is linear all the same.
 
-After some trials the attempts' weights are drawn from a Bayesian bootstrap: where they disagree,
-the next trial differs. Attempts that did not fail tell what the action does, but not where they
-would have ended, and are left out of steps 1 and 2.
+An attempt that lasted less long than the demonstrations did counts for less in all of it: a cart
+that is pushed over shows the push, not the fall. After some trials the weights are drawn from a
+Bayesian bootstrap besides, so that where attempts disagree, the next trial differs; and every other
+of these trials keeps half of the policy that has lasted longest. Attempts that did not fail tell
+what the action does, but not where they would have ended, and are left out of steps 1 and 2.
 """
 
 from collections.abc import Sequence
@@ -34,7 +36,7 @@ from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
 from misstep.learners.learner import LEARNERS, Evidence, Task, joint_samples
-from misstep.learners.linear import LinearLearner, LinearPolicy
+from misstep.learners.linear import LinearLearner, LinearPolicy, longest_lasting
 from misstep.parameters import check_parameters, parameter
 from misstep.trajectory import Trajectory
 
@@ -112,8 +114,10 @@ class Fall(LinearLearner):
         cut = [_until_failure(t) for t in evidence.attempts]
         origin = np.mean([t.select(task.state)[0] for t in cut], axis=0)
         spread = joint_samples(task, cut)[:, : len(task.state)].std(axis=0)
+        weights = shares_of_the_usual(cut, len(evidence.demonstrations))
         steady = len(evidence.trials) < self.steady_trials
-        weights = np.ones(len(cut)) if steady else rng.exponential(size=len(cut))
+        if not steady:
+            weights *= rng.exponential(size=len(cut))
         centre, half = _limits(task)
         # A limit that nobody comes near is no measure of an action.
         used = np.concatenate([np.abs(t.actions - centre) for t in cut]).max(axis=0)
@@ -126,9 +130,12 @@ class Fall(LinearLearner):
         dangers = sorted((learn_danger(way, task.dt) for way in ways), key=lambda d: d.time_scale)
         rows = cascade(attempts, dangers, self.horizon, task.dt)
         gain = rows[:, 1:] / spread
-        return LinearPolicy(
+        policy = LinearPolicy(
             task, centre + half * (rows[:, 0] - gain @ origin), half[:, None] * gain
         )
+        if steady or rng.random() < 0.5:
+            return policy
+        return _half_way(longest_lasting(evidence), policy)
 
 
 def ways_to_fail(attempts: Sequence[Scaled], n_demonstrations: int) -> list[list[Scaled]]:
@@ -242,6 +249,16 @@ def _leading_direction(ends: Array) -> Array:
     """Return the unit vector along which ends (N, n) are longest, shape (n,)."""
     direction: Array = np.linalg.svd(ends, full_matrices=False)[2][0]
     return direction
+
+
+def shares_of_the_usual(attempts: Sequence[Trajectory], n_demonstrations: int) -> Array:
+    """Return how long attempts lasted, of the demonstrations' median; at most 1."""
+    lasted = np.array([attempt.duration for attempt in attempts])
+    return np.minimum(1.0, lasted / np.median(lasted[:n_demonstrations]))
+
+
+def _half_way(a: LinearPolicy, b: LinearPolicy) -> LinearPolicy:
+    return LinearPolicy(a.task, 0.5 * (a.bias + b.bias), 0.5 * (a.gain + b.gain))
 
 
 def _until_failure(trajectory: Trajectory) -> Trajectory:

@@ -178,9 +178,14 @@ class HillClimbing(LinearLearner):
         space = LinearSpace(task, evidence.demonstrations)
         if not evidence.trials:
             return space.policy(space.average())
-        best = max(range(len(evidence.trials)), key=lambda i: time_lasted(evidence.trials[i]))
-        vector = space.vector(evidence.policies[best])  # type: ignore[arg-type]
+        vector = space.vector(longest_lasting(evidence))
         return space.policy(space.perturbed(vector, self.size, rng))
+
+
+def longest_lasting(evidence: Evidence) -> LinearPolicy:
+    """Return the linear policy of the trial that went well for longest."""
+    best = max(range(len(evidence.trials)), key=lambda i: time_lasted(evidence.trials[i]))
+    return evidence.policies[best]  # type: ignore[return-value]
 
 
 def time_lasted(trial: Trajectory) -> float:

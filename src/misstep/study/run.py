@@ -7,7 +7,8 @@
     report.html           all of it on one page
 
 A cell's file appears in one step when the cell is done. Whatever is interrupted, at whatever
-moment, the same command goes on; cells that were lost are tried again.
+moment, the same command goes on, and so does `misstep resume`. Cells that were lost are tried
+again.
 """
 
 import json
@@ -29,7 +30,7 @@ from misstep.workers import Lost, Progress, check_workers, run_in_processes, sil
 
 CONFIG = "study.json"
 ENGINES = ("processes", "ray")
-MAX_VIDEOS = 12
+MAX_VIDEOS = 40
 
 _SHORT = 60
 
@@ -98,6 +99,28 @@ def run_study(
         steps.count(f"{cell.title}: {result.summary}")
     measured = [table.Measured(cell, CellResult.load(cell_file(out, cell))) for cell in study.cells]
     return _write(out, study, measured, processes, steps)
+
+
+def held_study(out: Path) -> Study:
+    """Return the study that a folder holds, finished or not.
+
+    Raises
+    ------
+    MisstepError
+        If it holds none, a damaged one, or one of another version.
+    """
+    values = read_json(out / CONFIG)
+    if not isinstance(values, dict) or "study" not in values:
+        raise MisstepError(f"{out / CONFIG} is damaged: it describes no study")
+    if values.get("version") != __version__:
+        raise MisstepError(
+            f"{out} holds a study of misstep {values.get('version')}, but this is {__version__}: "
+            "go on with that one, or choose another folder"
+        )
+    try:
+        return Study.from_json(values["study"])
+    except MisstepError as error:
+        raise MisstepError(f"{out / CONFIG} is damaged: {error}") from error
 
 
 def _engine(name: str, workers: int | None, address: str | None) -> Engine:
@@ -183,12 +206,15 @@ def _write(
 def _film(
     folder: Path, measured: list[table.Measured], workers: int, steps: "_Steps"
 ) -> list[page.Film]:
-    """Write a video of the first success of every case and learner, up to a number."""
+    """Write a video of the first success of every learner in every case, up to a number.
+
+    Variants of a case share one.
+    """
     make_folder(folder)
     first: dict[tuple[str, str], Cell] = {}
     for cell, result in measured:
         if result.trials_to_success is not None:
-            first.setdefault((cell.case.name, cell.learner.label), cell)
+            first.setdefault((cell.case.group, cell.learner.label), cell)
     videos = [
         Video(cell, folder / f"{number:02d}.mp4")
         for number, cell in enumerate(list(first.values())[:MAX_VIDEOS], start=1)

@@ -172,6 +172,28 @@ class Study:
         """Return all of it as plain values."""
         return asdict(self)
 
+    @classmethod
+    def from_json(cls, values: Any) -> "Study":
+        """Return the study that `to_json` described.
+
+        Raises
+        ------
+        MisstepError
+            If `values` is anything else.
+        """
+        try:
+            return cls(**{**values, "cases": tuple(_case_from_json(c) for c in values["cases"])})
+        except (TypeError, KeyError) as error:
+            raise MisstepError(f"it describes no study ({error})") from error
+
+
+def _case_from_json(values: Mapping[str, Any]) -> Case:
+    choices = {
+        name: tuple(Choice(**choice) for choice in values[name])
+        for name in ("demonstrators", "learners")
+    }
+    return Case(**{**values, **choices, "state": tuple(values["state"])})
+
 
 def settings(parameters: Mapping[str, ParameterValue]) -> str:
     """Return parameters in one line: ``noise=8, hold=0.2``."""
