@@ -351,6 +351,21 @@ def test_the_tables_say_what_the_cells_say(whole, spec):
         assert row["tests_count"] == sum(result.survived for result in own)
 
 
+def test_the_short_table_puts_demonstrators_and_variants_together(whole):
+    cells = rows(whole / "cells.csv")
+    lines = [line.split("|")[1:-1] for line in (whole / "summary.md").read_text().splitlines()]
+    task, found = "", {}
+    for line in lines[2:]:
+        task = line[0].strip() or task
+        found[task, line[1].strip(" `")] = line[3:]
+    assert set(found) == {("balance", "donut"), ("balance", "fall"), ("robust", "fall")}
+    for (task, learner), (succeeded, first, *_) in found.items():
+        own = [c for c in cells if c["case"].startswith(task) and c["learner"] == learner]
+        successes = [c["trials_to_success"] for c in own if c["trials_to_success"]]
+        assert succeeded.split("(")[0].strip() == f"{len(successes)} of {len(own)}"
+        assert int(first) == successes.count("1")
+
+
 def test_the_page_holds_everything_and_reaches_outside_for_nothing(whole, spec):
     page = (whole / "report.html").read_text()
     assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
@@ -381,6 +396,13 @@ def test_one_worker_killed_and_resumed_gives_the_same_tables(whole, tmp_path):
     assert main(["resume", str(out)]) == 0
     assert tables(out) == tables(whole)
     assert {path: path.stat().st_mtime_ns for path in finished} == finished
+
+
+def test_a_learner_that_takes_long_makes_the_first_of_the_seeds_and_tests(tmp_path):
+    text = GOOD.replace('"donut"', '{ name = "donut", seeds = 1, tests = 0 }')
+    cells = [c for c in load_study(write(tmp_path, text)).cells if c.case.name == "balance"]
+    made = [(c.learner.name, c.repetition, c.tests) for c in cells]
+    assert made == 2 * [("donut", 0, 0), ("fall", 0, 2), ("fall", 1, 2)]
 
 
 def test_a_folder_remembers_its_whole_study(whole, spec):

@@ -5,6 +5,7 @@ cells.py         one run of it: demonstrate, learn, test the final policy
 run.py           all of them, on processes or on Ray, resumable
 ray_engine.py    the only file that knows Ray
 table.py         cells.csv, summary.csv, summary.json
+markdown.py      summary.md, the short table
 figures.py       learning curves and histograms
 page.py          report.html
 """

@@ -105,7 +105,7 @@ def run_cell(cell: Cell) -> CellResult:
     with threadpool_limits(limits=1):
         try:
             run = _learn(cell, runs.append)
-            survived = _test(cell, run) if cell.case.tests else None
+            survived = _test(cell, run) if cell.tests else None
         except MisstepError as raised:
             error = str(raised)
         # A fault in one learner must not cost the other thousand cells; the page shows it.
@@ -120,7 +120,7 @@ def run_cell(cell: Cell) -> CellResult:
         outcomes=tuple(str(trial.outcome) for trial in trials),
         failure_times=tuple(trial.failure_time for trial in trials),
         costs=tuple(trial.mean_cost for trial in trials),
-        tests=cell.case.tests,
+        tests=cell.tests,
         survived=survived,
         timing=Timing(
             computing_seconds=sum(runs[-1].computing_seconds) if runs else 0.0,
@@ -178,7 +178,7 @@ def _learn(cell: Cell, on_trial: Callable[[Run], None]) -> Run:
 def _test(cell: Cell, run: Run) -> int:
     case = cell.case
     system = make_system(case.system, **{**case.parameters, **case.test_parameters})
-    return evaluate(system, run.policy, episodes=case.tests, seed=_seed(cell, 2)).successes
+    return evaluate(system, run.policy, episodes=cell.tests, seed=_seed(cell, 2)).successes
 
 
 def _seed(cell: Cell, purpose: int) -> int:

@@ -3,6 +3,7 @@
     study.json            version, command, the whole specification
     cells/CASE/DEMONSTRATOR/LEARNER/000.json    the result of one cell
     cells.csv             one row a cell; summary.csv, summary.json: one row a combination
+    summary.md            all demonstrators together, as a table for a README
     figures/  videos/     PNG and MP4
     report.html           all of it on one page
 
@@ -21,7 +22,7 @@ from pathlib import Path
 from misstep.errors import MisstepError
 from misstep.runs import make_folder, read_json
 from misstep.storage import write_json, write_text
-from misstep.study import figures, page, table
+from misstep.study import figures, markdown, page, table
 from misstep.study.cells import CellResult, Video, cell_file, run_cell, write_first_success
 from misstep.study.ray_engine import check_ray, run_on_ray
 from misstep.study.spec import Cell, Study
@@ -94,7 +95,7 @@ def run_study(
     steps.done = len(study.cells) - len(missing)
     for cell, result in run(missing) if missing else ():
         if isinstance(result, Lost):
-            result = CellResult("lost", f"lost: {result.reason}", tests=cell.case.tests)
+            result = CellResult("lost", f"lost: {result.reason}", tests=cell.tests)
         _save(out, cell, result)
         steps.count(f"{cell.title}: {result.summary}")
     measured = [table.Measured(cell, CellResult.load(cell_file(out, cell))) for cell in study.cells]
@@ -195,6 +196,7 @@ def _write(
 ) -> Report:
     rows = table.summarise(measured)
     table.write_tables(out, measured, rows)
+    write_text(out / "summary.md", markdown.short_table(measured))
     pictures = figures.draw_all(out / "figures", measured)
     films = _film(out / "videos", measured, workers, steps) if study.videos else []
     target = out / "report.html"

@@ -17,9 +17,10 @@
     variants = [{ delay = 0 }, { delay = 0.02 }]    # the same again with each of these set
     demonstrators = ["weak", { name = "noisy", with = { noise = 8 } }]
     demonstrations = 4
-    learners = ["fall", { name = "donut", with = { reach = 3 } }]
+    learners = ["fall", { name = "donut", with = { reach = 3 } }, { name = "cma-es", seeds = 20 }]
 
-A case may set ``seeds``, ``max_trials`` and ``tests`` for itself. Of a case only ``name``,
+A case may set ``seeds``, ``max_trials`` and ``tests`` for itself, and a learner that takes long
+fewer ``seeds`` and ``tests`` than its case: the first of them. Of a case only ``name``,
 ``system``, ``demonstrators`` and ``learners`` are necessary. Everything is built once while the
 file is read, so that a mistake is told before anything runs.
 """
@@ -76,7 +77,8 @@ _CASE: dict[str, type] = {
     "max_trials": int,
     "tests": int,
 }
-_CHOICE: dict[str, type] = {"name": str, "with": dict}
+_DEMONSTRATOR: dict[str, type] = {"name": str, "with": dict}
+_LEARNER: dict[str, type] = {**_DEMONSTRATOR, "seeds": int, "tests": int}
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,10 @@ class Choice:
 
     name: str
     parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
+    seeds: int | None = None
+    """Repetitions with this learner, where they are fewer than the case's."""
+    tests: int | None = None
+    """Tests of its final policies, likewise."""
 
     @property
     def label(self) -> str:
@@ -135,6 +141,11 @@ class Cell:
         return self.case.name, self.demonstrator.label, self.learner.label, self.repetition
 
     @property
+    def tests(self) -> int:
+        """Starts from which the final policy is tried."""
+        return _fewer(self.case.tests, self.learner.tests)
+
+    @property
     def title(self) -> str:
         """One line that names it."""
         case, demonstrator, learner, repetition = self.key
@@ -158,7 +169,7 @@ class Study:
             for case in self.cases
             for demonstrator in case.demonstrators
             for learner in case.learners
-            for repetition in range(case.seeds)
+            for repetition in range(_fewer(case.seeds, learner.seeds))
         ]
 
     def quick(self) -> "Study":
@@ -185,6 +196,10 @@ class Study:
             return cls(**{**values, "cases": tuple(_case_from_json(c) for c in values["cases"])})
         except (TypeError, KeyError) as error:
             raise MisstepError(f"it describes no study ({error})") from error
+
+
+def _fewer(of_case: int, of_learner: int | None) -> int:
+    return of_case if of_learner is None else min(of_case, of_learner)
 
 
 def _case_from_json(values: Mapping[str, Any]) -> Case:
@@ -240,7 +255,7 @@ def _read_case(entry: dict[str, Any]) -> list[Case]:
     _check_table(entry, _CASE, required=("name", "system", "demonstrators", "learners"))
     _check_name(entry["name"])
     variants = _list_of(entry, "variants", dict) if "variants" in entry else [{}]
-    shown = _choices(entry, "demonstrators")
+    shown = _choices(entry, "demonstrators", _DEMONSTRATOR)
     case = Case(
         group=entry["name"],
         variant="",
@@ -250,7 +265,7 @@ def _read_case(entry: dict[str, Any]) -> list[Case]:
         state=tuple(_list_of(entry, "state", str)) if "state" in entry else (),
         demonstrators=shown,
         demonstrations=entry.get("demonstrations", 4),
-        learners=_choices(entry, "learners"),
+        learners=_choices(entry, "learners", _LEARNER),
         **{name: entry[name] for name in ("seeds", "max_trials", "tests")},
     )
     return [_built(case, variant) for variant in variants]
@@ -275,8 +290,8 @@ def _built(case: Case, variant: dict[str, ParameterValue]) -> Case:
     return replace(case, variant=settings(variant), parameters=parameters, state=state)
 
 
-def _choices(entry: Mapping[str, Any], key: str) -> tuple[Choice, ...]:
-    """Return demonstrators or learners, each a name or a table of a name and parameters."""
+def _choices(entry: Mapping[str, Any], key: str, keys: Mapping[str, type]) -> tuple[Choice, ...]:
+    """Return demonstrators or learners, each a name or a table."""
     choices = []
     for item in entry[key]:
         table = {"name": item} if isinstance(item, str) else item
@@ -285,8 +300,9 @@ def _choices(entry: Mapping[str, Any], key: str) -> tuple[Choice, ...]:
                 f'{key} holds {item!r}: each is a name or {{ name = "...", with = {{ ... }} }}'
             )
         with _inside(key):
-            _check_table(table, _CHOICE, required=("name",))
-        choices.append(Choice(table["name"], table.get("with", {})))
+            _check_table(table, keys, required=("name",))
+        numbers = {name: table.get(name) for name in ("seeds", "tests")}
+        choices.append(Choice(table["name"], table.get("with", {}), **numbers))
     if not choices:
         raise MisstepError(f"{key} is empty: name at least one")
     _check_distinct(key, [choice.label for choice in choices])

@@ -12,7 +12,7 @@ import csv
 import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -144,6 +144,17 @@ def summarise(measured: Iterable[Measured]) -> list[Summary]:
     for entry in measured:
         groups.setdefault(entry.cell.key[:3], []).append(entry)
     return [_summary(entries) for entries in groups.values()]
+
+
+def pooled(measured: Iterable[Measured]) -> list[Summary]:
+    """Return one row a case of the file and learner, its demonstrators and variants together."""
+    groups: dict[tuple[str, str], list[Measured]] = {}
+    for entry in measured:
+        groups.setdefault((entry.cell.case.group, entry.cell.learner.label), []).append(entry)
+    return [
+        replace(_summary(entries), case=group, variant="", demonstrator="all")
+        for (group, _), entries in groups.items()
+    ]
 
 
 def _summary(entries: Sequence[Measured]) -> Summary:
