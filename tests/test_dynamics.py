@@ -9,6 +9,7 @@ from scipy.linalg import solve_discrete_are
 from misstep import demonstrate, learn, make_system
 from misstep.costs import EFFORT, FREE_SHARE, StateCost
 from misstep.dynamics import (
+    Circles,
     Encoding,
     ForwardModel,
     Kinematics,
@@ -17,7 +18,7 @@ from misstep.dynamics import (
     compiled,
 )
 from misstep.dynamics.encoding import wrapped_differences
-from misstep.dynamics.forward_model import outlier_weights
+from misstep.dynamics.forward_model import outlier_weights, transitions
 from misstep.dynamics.gaussian_process import (
     JITTER,
     Hyperparameters,
@@ -92,7 +93,7 @@ def predict(model, states, actions):
 
 
 @given(seed=SEEDS)
-def test_encoding_round_trip(seed):
+def test_encoding_can_be_undone(seed):
     rng = np.random.default_rng(seed)
     angles = rng.random(4) < 0.5
     states = rng.normal(size=(20, 4)) * rng.uniform(0.01, 100.0, 4)
@@ -100,7 +101,11 @@ def test_encoding_round_trip(seed):
     low, high = -rng.uniform(0.1, 10.0, 2), rng.uniform(0.1, 10.0, 2)
     encoding = Encoding.of(states, angles, low, high)
     encoded = encoding.encode(states)
-    np.testing.assert_allclose(encoding.decode(encoded), states, rtol=1e-9, atol=1e-12)
+    sines = np.cumsum(1 + angles) - 1 - angles
+    decoded = encoded[:, sines] * encoding.scale + encoding.mean
+    turning = sines[angles]
+    decoded[:, angles] = np.arctan2(encoded[:, turning], encoded[:, turning + 1])
+    np.testing.assert_allclose(decoded, states, rtol=1e-9, atol=1e-12)
     assert encoded.shape == (20, 4 + angles.sum())
     actions = rng.uniform(low, high, (20, 2))
     assert np.all(np.abs(encoding.encode_actions(actions)) <= 1.0)
@@ -118,6 +123,58 @@ def test_angles_change_the_short_way_round():
     before, after = np.array([[3.1, 3.1]]), np.array([[-3.1, -3.1]])
     change = wrapped_differences(before, after, np.array([True, False]))
     np.testing.assert_allclose(change, [[2 * np.pi - 6.2, -6.2]])
+
+
+# Circles
+
+
+def turning(rng, n=200):
+    """States of x, cos θ, the rate, sin θ; and θ itself."""
+    theta = np.cumsum(rng.normal(scale=0.3, size=n))
+    columns = [rng.normal(size=n), np.cos(theta), np.gradient(theta), np.sin(theta)]
+    return np.column_stack(columns), theta
+
+
+def free_cost(goal, weights):
+    return StateCost(goal, weights, (np.inf,) * len(goal))
+
+
+def test_a_cosine_and_its_sine_are_found_and_unrolled():
+    states, theta = turning(np.random.default_rng(0))
+    circles = Circles.find(states, free_cost((0.0, 1.0, 0.0, 0.0), (1.0, 2.0, 0.1, 2.0)))
+    np.testing.assert_array_equal(circles.pairs, [[1], [3]])
+    np.testing.assert_array_equal(circles.angles, [False, True, False])
+    unrolled = circles.unroll(states)
+    np.testing.assert_array_equal(unrolled[:, [0, 2]], states[:, [0, 2]])
+    off = unrolled[:, 1] - theta
+    np.testing.assert_allclose(off, 2 * np.pi * np.round(off / (2 * np.pi)), atol=1e-12)
+    np.testing.assert_array_equal(circles.unroll(states[3]), unrolled[3])
+
+
+@given(seed=SEEDS)
+def test_unrolled_states_cost_the_same_but_for_a_constant(seed):
+    rng = np.random.default_rng(seed)
+    states, _ = turning(rng)
+    weight = rng.uniform(0.1, 10.0)
+    cost = free_cost(tuple(rng.normal(size=4)), (1.0, weight, 0.1, weight))
+    circles = Circles.find(states, cost)
+    unrolled = circles.unroll_cost(cost)(circles.unroll(states), circles.angles)
+    difference = unrolled - cost(states, np.zeros(4, bool))
+    np.testing.assert_allclose(difference, difference[0], atol=1e-9)
+
+
+def test_what_is_no_circle_is_left_alone():
+    rng = np.random.default_rng(0)
+    states, _ = turning(rng)
+    cost = free_cost((0.0,) * 4, (1.0,) * 4)
+    noisy = states + 0.01 * rng.normal(size=states.shape)
+    still = np.column_stack([np.ones(50), 1e-4 * rng.normal(size=(50, 3))])
+    unequal = free_cost((0.0,) * 4, (1.0, 2.0, 1.0, 1.0))
+    walled = replace(cost, limits=(np.inf, 0.5, np.inf, np.inf))
+    for case in ((noisy, cost), (still, cost), (states, unequal), (states, walled)):
+        circles = Circles.find(*case)
+        assert circles.pairs.size == 0
+        np.testing.assert_array_equal(circles.unroll(case[0]), case[0])
 
 
 # Gaussian process
@@ -215,7 +272,40 @@ def test_a_column_that_only_resembles_an_integral_is_learned():
     rng = np.random.default_rng(0)
     states, changes = rng.normal(size=(300, 2)), rng.normal(size=(300, 2))
     changes[:, 0] = 0.02 * states[:, 1] + 0.002 * rng.normal(size=300)
-    assert np.all(Kinematics.find(states, changes).source == -1)
+    assert np.all(Kinematics.find(states, changes, np.zeros(2, bool)).source == -1)
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_an_angle_may_count_against_its_velocity(sense):
+    rate = np.random.default_rng(0).normal(size=300)
+    angle = np.cumsum(0.02 * sense * rate)
+    states, changes = np.column_stack([angle, rate])[:-1], np.diff([angle, rate]).T
+    for turns, found in ((True, 1), (False, 1 if sense > 0 else -1)):
+        kinematics = Kinematics.find(states, changes, np.array([turns, False]))
+        np.testing.assert_array_equal(kinematics.source, [found, -1])
+
+
+def test_a_last_step_that_lasts_longer_is_left_out():
+    system = make_system("flipup")
+    dataset = demonstrate(system, "bracket", n=4, seed=0)
+    angles = np.array([column.unit == "rad" for column in system.observation_columns])
+    states, actions, changes = transitions(recordings(dataset), angles)
+    assert len(states) == len(actions) == len(changes) == sum(t.n_steps - 1 for t in dataset)
+    np.testing.assert_array_equal(states[: dataset[0].n_steps - 1], dataset[0].observations[:-2])
+
+
+@pytest.mark.parametrize("by", ["noisy", "weak", "delayed", "reversed", "random", "bang-bang"])
+def test_the_last_step_of_a_fall_is_kept(cartpole, by):
+    dataset = demonstrate(cartpole, by, n=4, seed=1)
+    states, _, changes = transitions(recordings(dataset), ANGLES)
+    assert len(states) == sum(t.n_steps for t in dataset)
+    np.testing.assert_allclose(states[-1] + changes[-1], dataset[-1].observations[-1])
+
+
+def test_single_steps_are_all_kept():
+    one = (np.zeros((2, 2)), np.zeros((1, 1)))
+    other = (np.array([[0.0, 0.0], [9.0, 0.0]]), np.ones((1, 1)))
+    assert len(transitions([one, other], np.zeros(2, bool))[0]) == 2
 
 
 def test_prediction_of_a_swing_that_was_not_shown(model, cartpole):
@@ -427,6 +517,19 @@ def test_a_policy_depends_on_the_state_alone(cartpole, shown):
     assert rollout(short, policy, seed=0, demonstrator="").outcome is Outcome.SUCCESS
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_pendulum_seen_as_cosine_and_sine_swings_up(seed):
+    system = make_system("gym:Pendulum-v1")
+    run = learn(system, demonstrate(system, "random", n=4, seed=seed), "dynamics", seed=seed)
+    assert run.trials_to_success == 1
+    np.testing.assert_array_equal(run.policy.known.circles.pairs, [[0], [1]])
+    restored = Dynamics.restore(Task.of(system), run.policy.arrays())
+    for p in (run.policy, restored):
+        p.reset()
+    for observation in run.trials[0].observations[:5]:
+        np.testing.assert_array_equal(run.policy(observation), restored(observation))
+
+
 def test_a_failed_trial_is_learned_from_at_its_start_only(cartpole, shown):
     learner, task = Dynamics(trial_seconds=0.5, centres=10), Task.of(cartpole)
     failed = demonstrate(make_system("cartpole", stop_at_fall=False), "weak", n=1)[0].cut(60)
@@ -446,7 +549,7 @@ def test_a_failed_trial_is_learned_from_at_its_start_only(cartpole, shown):
 
 def test_a_cost_is_needed(refused, cartpole, shown):
     task = replace(Task.of(cartpole), cost=None)
-    with refused("dynamics needs a cost as a function"):
+    with refused("learning the dynamics needs a cost as a function"):
         Dynamics().policy(task, Evidence(tuple(shown), ()), np.random.default_rng(0))
 
 
@@ -463,6 +566,8 @@ def test_a_cost_of_other_columns_is_refused(refused, cartpole, shown):
         ("model_constant", lambda a: a[:1], "forward model's local has shape"),
         ("model_source", lambda a: a + 100, "each integral needs a learned source"),
         ("goal", lambda a: a[1:], "its cost"),
+        ("circles", lambda a: np.array([[0], [4]]), "two rows of distinct columns, from 0 to 3"),
+        ("circles", lambda a: np.array([[1], [1]]), "two rows of distinct columns, from 0 to 3"),
         ("settings", lambda a: a * [0, 1], "horizon is 0 steps"),
     ],
 )

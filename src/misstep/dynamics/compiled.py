@@ -1,8 +1,8 @@
-"""The compiled loops of planning: the model's step with its Jacobians, rollouts, iLQR.
+"""The compiled loops of planning: the model's step with its Jacobians, rollouts, iLQR, networks.
 
 Everything here takes plain arrays that the callers have validated, in groups that change together:
-`Model`, `Cost` and `Workspace`. The workspace holds every intermediate result, so that a control
-step allocates nothing.
+`Model`, `Cost`, `Networks` and `Workspace`. The workspace holds every intermediate result, so that
+a control step allocates nothing.
 
 A step costs one exponential a centre and a few inner products over the centres, which value and
 Jacobian share. The exponent is expanded, −½|z − c|² = z·c − ½|c|² − ½|z|², everything constant in
@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from misstep.costs import EFFORT, FREE_SHARE, WALL
+from misstep.costs import EFFORT, FREE_SHARE, WALL, StateCost
 from misstep.errors import MisstepError
 from misstep.mixture.compiled import REORDER, exp_block
 
@@ -123,6 +123,23 @@ class Cost(NamedTuple):
     weights: Array
     inverse_limits: Array
 
+    @classmethod
+    def of(cls, cost: StateCost, angles: NDArray[np.bool_]) -> "Cost":
+        """Return the arrays of a cost of states whose columns `angles` (n,) wrap."""
+        limits = np.array(cost.limits, dtype=np.float64)
+        return cls(angles, np.array(cost.goal), np.array(cost.weights), 1.0 / limits)
+
+
+class Networks(NamedTuple):
+    """P networks of one hidden layer: u = tanh(outer [tanh(inner [z, 1]), 1])."""
+
+    inner: Array
+    """Shape (P, units, nz + 1)."""
+    outer: Array
+    """Shape (P, m, units + 1)."""
+    hidden: Array
+    """Room for the hidden units, shape (units,)."""
+
 
 class Workspace(NamedTuple):
     """Room for the intermediate results of planning over H steps."""
@@ -181,10 +198,8 @@ class Workspace(NamedTuple):
 
 
 @njit(**_INLINED)
-def _evaluate_basis(model, state, work):
-    """Fill `work.encoded` with z/ℓ and `work.basis` with the exponentials at `state`."""
-    z = work.encoded
-    exponent = work.exponent
+def _encode(model, state, z):
+    """Fill `z` (nz,) with the encoded state."""
     k = 0
     for i in range(state.shape[0]):
         if model.angles[i]:
@@ -194,6 +209,14 @@ def _evaluate_basis(model, state, work):
         else:
             z[k] = (state[i] - model.mean[i]) * model.inverse_scale[i]
             k += 1
+
+
+@njit(**_INLINED)
+def _evaluate_basis(model, state, work):
+    """Fill `work.encoded` with z/ℓ and `work.basis` with the exponentials at `state`."""
+    z = work.encoded
+    exponent = work.exponent
+    _encode(model, state, z)
     n_centres = exponent.shape[0]
     half = 0.0
     for k in range(z.shape[0]):
@@ -380,6 +403,48 @@ def rank(model, cost, state, plans, costs, work):
             _step(model, states[t], plans[p, t], states[t + 1], work)
             factor = FINAL_WEIGHT if t == horizon - 1 else 1.0
             total += factor * _state_cost(cost, states[t + 1]) + _effort(plans[p, t])
+        costs[p] = total
+
+
+@njit(**_INLINED)
+def _act(model, network, p, state, action, work):
+    """Fill `action` (m,) with what network p of `network` does at `state`; uses `work.encoded`."""
+    z = work.encoded
+    _encode(model, state, z)
+    nz = z.shape[0]
+    n_units = network.hidden.shape[0]
+    for h in range(n_units):
+        total = network.inner[p, h, nz]
+        for k in range(nz):
+            total += network.inner[p, h, k] * z[k]
+        network.hidden[h] = math.tanh(total)
+    for c in range(action.shape[0]):
+        total = network.outer[p, c, n_units]
+        for h in range(n_units):
+            total += network.outer[p, c, h] * network.hidden[h]
+        action[c] = math.tanh(total)
+
+
+@njit(**_COMPILED)
+def imagine(model, cost, networks, starts, noise, costs, work):
+    """Fill `costs` (P,) with the cost of each of P networks over all imagined rollouts.
+
+    Rollout r begins at `starts` (R, n); what `noise` (R, H, n) holds is added after each step.
+    """
+    n_rollouts, horizon, n = noise.shape
+    states = work.new_states
+    action = work.new_plan[0]
+    for p in range(costs.shape[0]):
+        total = 0.0
+        for r in range(n_rollouts):
+            _copy(starts[r], states[0])
+            for t in range(horizon):
+                before, after = states[t % 2], states[1 - t % 2]
+                _act(model, networks, p, before, action, work)
+                _step(model, before, action, after, work)
+                for i in range(n):
+                    after[i] += noise[r, t, i]
+                total += _state_cost(cost, after) + _effort(action)
         costs[p] = total
 
 

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Encoding:
-    """Invertible map from states and actions to what a model is fitted on.
+    """Map from states and actions to what a model is fitted on.
 
     Parameters
     ----------
@@ -53,18 +53,6 @@ class Encoding:
                 columns += [np.sin(states[:, i]), np.cos(states[:, i])]
             else:
                 columns.append((states[:, i] - self.mean[i]) / self.scale[i])
-        return np.stack(columns, axis=1)
-
-    def decode(self, encoded: Array) -> Array:
-        """Return the states (N, n) of encoded ones, angles in (−π, π]."""
-        columns, k = [], 0
-        for i, angle in enumerate(self.angles):
-            if angle:
-                columns.append(np.arctan2(encoded[:, k], encoded[:, k + 1]))
-                k += 2
-            else:
-                columns.append(encoded[:, k] * self.scale[i] + self.mean[i])
-                k += 1
         return np.stack(columns, axis=1)
 
     def encode_actions(self, actions: Array) -> Array:

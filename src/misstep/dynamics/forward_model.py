@@ -26,6 +26,8 @@ Recording = tuple[Array, Array]
 """Observations (T + 1, n) and actions (T, m)."""
 
 FEWEST_TRANSITIONS = 8
+# Falls, impacts of a pole on its way and noise stay below 2, strokes that last beyond 13.
+LONGER_STEP = 5.0
 # A column is another's integral if that leaves less than this share of its change unexplained.
 KINEMATIC_TOLERANCE = 0.02
 # … in all but a few rows: a rail stop or a bad sample is no reason to learn an integral.
@@ -55,7 +57,7 @@ class Kinematics:
     source : ndarray of int, shape (n,)
         j of each column i, −1 where a column is no integral.
     alpha, beta : ndarray, shape (n,)
-        In seconds, where j is the velocity of i; 1.
+        Where j is the velocity of i, α is in seconds.
     """
 
     source: NDArray[np.int64]
@@ -63,8 +65,11 @@ class Kinematics:
     beta: Array
 
     @classmethod
-    def find(cls, states: Array, changes: Array) -> Self:
-        """Find the pairs in transitions, `states` and `changes` both (N, n); best first."""
+    def find(cls, states: Array, changes: Array, angles: NDArray[np.bool_]) -> Self:
+        """Find the pairs in transitions, `states` and `changes` both (N, n); best first.
+
+        α is positive, but for an angle, which may count against its velocity.
+        """
         n = states.shape[1]
         source, alpha, beta = np.full(n, -1, dtype=np.int64), np.zeros(n), np.zeros(n)
         velocities: set[int] = set()
@@ -76,7 +81,7 @@ class Kinematics:
         ]
         for residual, a, b, i, j in sorted(candidates):
             free = source[i] < 0 and source[j] < 0 and i not in velocities
-            if residual < KINEMATIC_TOLERANCE and a > 0 and free:
+            if residual < KINEMATIC_TOLERANCE and (a > 0 or angles[i]) and free:
                 source[i], alpha[i], beta[i] = j, a, b
                 velocities.add(j)
         return cls(source, alpha, beta)
@@ -121,7 +126,8 @@ class ForwardModel:
     ) -> Self:
         """Learn from recordings.
 
-        Where there are more than 200 transitions and some lie far off what a smooth model says, as
+        The last step of a recording may last longer than all others, see `transitions`. Where
+        there are more than 200 transitions and some lie far off what a smooth model says, as
         contacts, rail stops and bad samples do, these get Student's t for their noise, by
         reweighting.
 
@@ -140,9 +146,7 @@ class ForwardModel:
         MisstepError
             If there are fewer than 8 transitions, or an action has no finite limits.
         """
-        states = np.concatenate([observations[:-1] for observations, _ in recordings])
-        after = np.concatenate([observations[1:] for observations, _ in recordings])
-        actions = np.concatenate([actions for _, actions in recordings])
+        states, actions, changes = transitions(recordings, angles)
         if len(states) < FEWEST_TRANSITIONS:
             raise MisstepError(
                 f"the recordings hold {len(states)} transitions: a forward model needs at least "
@@ -153,9 +157,8 @@ class ForwardModel:
                 f"the actions range from {action_low} to {action_high}: a forward model needs "
                 "finite limits"
             )
-        changes = wrapped_differences(states, after, angles)
         encoding = Encoding.of(states, angles, action_low, action_high)
-        kinematics = Kinematics.find(states, changes)
+        kinematics = Kinematics.find(states, changes, angles)
         z, u = encoding.encode(states), encoding.encode_actions(actions)
         process = _fit_process(z, u, changes[:, kinematics.learned], rng, n_centres)
         free = angles | (kinematics.source >= 0)
@@ -207,6 +210,26 @@ class ForwardModel:
             low=self.low,
             high=self.high,
         )
+
+
+def transitions(
+    recordings: Sequence[Recording], angles: NDArray[np.bool_]
+) -> tuple[Array, Array, Array]:
+    """Return states (N, n), actions (N, m) and changes (N, n) of all steps of one length.
+
+    A system may let the last action act until its verdict, or end with an impact. The last step of
+    a recording is left out where it changes a column by more than 5 times the most that any step
+    before the last changes it.
+    """
+    changes = [wrapped_differences(o[:-1], o[1:], angles) for o, _ in recordings]
+    most = np.max([np.abs(c[:-1]).max(axis=0, initial=0.0) for c in changes], axis=0)
+    kept = [
+        len(c) - bool(most.any() and np.any(np.abs(c[-1]) > LONGER_STEP * most)) for c in changes
+    ]
+    states = [o[:k] for (o, _), k in zip(recordings, kept, strict=True)]
+    actions = [a[:k] for (_, a), k in zip(recordings, kept, strict=True)]
+    shown = [c[:k] for c, k in zip(changes, kept, strict=True)]
+    return np.concatenate(states), np.concatenate(actions), np.concatenate(shown)
 
 
 def _fit_process(

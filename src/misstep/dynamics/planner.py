@@ -51,11 +51,8 @@ class Planner:
     def __init__(
         self, model: compiled.Model, cost: StateCost, *, horizon: int = HORIZON, seed: int = 0
     ) -> None:
-        limits = np.array(cost.limits, dtype=np.float64)
         self.model = model
-        self.cost = compiled.Cost(
-            model.angles, np.array(cost.goal), np.array(cost.weights), 1.0 / limits
-        )
+        self.cost = compiled.Cost.of(cost, model.angles)
         self._work = compiled.Workspace.of(model, horizon)
         m = model.n_actions
         self._bank = random_plans(np.random.default_rng(seed), N_RANDOM, horizon, m)

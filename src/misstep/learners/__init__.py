@@ -6,6 +6,7 @@ from misstep.learners.donut import DonutLearner, DonutPolicy
 from misstep.learners.donut_cost import DonutCostLearner
 from misstep.learners.donut_incremental import DonutIncremental
 from misstep.learners.dynamics import Dynamics, DynamicsPolicy
+from misstep.learners.dynamics_policy import DynamicsPolicySearch, NetworkPolicy
 from misstep.learners.fall import Fall
 from misstep.learners.learner import LEARNERS, Evidence, LearnedPolicy, Learner, Task
 from misstep.learners.linear import HillClimbing, LinearPolicy, RandomLinear
@@ -24,6 +25,7 @@ __all__ = [
     "DonutPolicy",
     "Dynamics",
     "DynamicsPolicy",
+    "DynamicsPolicySearch",
     "Evidence",
     "Fall",
     "HillClimbing",
@@ -33,6 +35,7 @@ __all__ = [
     "Mean",
     "MeanPolicy",
     "MixturePolicy",
+    "NetworkPolicy",
     "Power",
     "RandomLinear",
     "RandomScaling",

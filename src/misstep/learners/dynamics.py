@@ -10,14 +10,15 @@ predicted nor does it cost anything.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from misstep.costs import StateCost
-from misstep.dynamics import ForwardModel, Planner
+from misstep.dynamics import Circles, ForwardModel, Planner
 from misstep.dynamics.compiled import Model
+from misstep.dynamics.forward_model import Recording
 from misstep.dynamics.planner import HORIZON
 from misstep.errors import MisstepError
 from misstep.learners.learner import LEARNERS, Evidence, Task
@@ -28,7 +29,54 @@ Array = NDArray[np.float64]
 
 _MODEL = "model_"
 _MODEL_TYPES: dict[str, Any] = {"angles": np.bool_, "learned": np.int64, "source": np.int64}
+_COST = ("goal", "weights", "limits")
 _LONGEST_HORIZON = 10_000
+
+
+class Known(NamedTuple):
+    """What has been learned of a system, in the coordinates that it was learned in."""
+
+    circles: Circles
+    """Which columns of the state are cosines and sines: the others see their angles."""
+    model: Model
+    """Of the unrolled state, with actions in [−1, 1]."""
+    cost: StateCost
+    """Of the unrolled state."""
+
+    def arrays(self) -> dict[str, Array]:
+        """Return all of it under distinct names."""
+        model = {_MODEL + name: values for name, values in self.model._asdict().items()}
+        cost = {name: np.array(getattr(self.cost, name)) for name in _COST}
+        return {**model, **cost, "circles": self.circles.pairs.astype(np.float64)}
+
+    @classmethod
+    def restore(cls, task: Task, arrays: Mapping[str, Array]) -> Self:
+        """Return what `arrays` described.
+
+        Raises
+        ------
+        MisstepError
+            If the arrays fit neither each other nor the task.
+        """
+        circles = restored_circles(task, arrays)
+        model = Model(
+            *(
+                np.ascontiguousarray(
+                    arrays[_MODEL + name], dtype=_MODEL_TYPES.get(name, np.float64)
+                )
+                for name in Model._fields
+            )
+        )
+        model.check()
+        cost = StateCost(*(tuple(arrays[name].astype(np.float64)) for name in _COST))
+        lengths = {len(getattr(cost, name)) for name in _COST}
+        n_kept, m = len(circles.kept), len(task.action_columns)
+        if (len(model.angles), model.n_actions) != (n_kept, m) or lengths != {n_kept}:
+            raise MisstepError(
+                f"the policy's model has {len(model.angles)} columns and {model.n_actions} "
+                f"actions and its cost {sorted(lengths)} columns, but the task has {n_kept} and {m}"
+            )
+        return cls(circles, model, cost)
 
 
 class DynamicsPolicy:
@@ -37,10 +85,7 @@ class DynamicsPolicy:
     Parameters
     ----------
     task : Task
-    model : Model
-        Of the state's columns, with actions in [−1, 1].
-    cost : StateCost
-        Of the state's columns.
+    known : Known
     horizon : int
         Length of a plan, in control periods.
     seed : int
@@ -49,26 +94,18 @@ class DynamicsPolicy:
     Raises
     ------
     MisstepError
-        If the model or the cost has other columns than the task.
+        If the horizon is not from 1 to 10,000.
     """
 
-    def __init__(self, task: Task, model: Model, cost: StateCost, horizon: int, seed: int) -> None:
-        model.check()
-        n, m = len(task.state), len(task.action_columns)
-        lengths = {len(values) for values in (cost.goal, cost.weights, cost.limits)}
-        if (len(model.angles), model.n_actions) != (n, m) or lengths != {n}:
-            raise MisstepError(
-                f"the policy's model has {len(model.angles)} columns and {model.n_actions} "
-                f"actions and its cost {sorted(lengths)} columns, but the task has {n} and {m}"
-            )
+    def __init__(self, task: Task, known: Known, horizon: int, seed: int) -> None:
         if not 1 <= horizon <= _LONGEST_HORIZON:
             raise MisstepError(
                 f"the policy's horizon is {horizon} steps; it must be 1 to {_LONGEST_HORIZON}"
             )
         self.task = task
-        self.planner = Planner(model, cost, horizon=horizon, seed=seed)
-        self._settings = np.array([horizon, seed], dtype=np.int64)
-        self._cost = cost
+        self.known = known
+        self.planner = Planner(known.model, known.cost, horizon=horizon, seed=seed)
+        self._settings = np.array([horizon, seed], dtype=np.float64)
         self._indices = task.state_indices
         self._middle = 0.5 * (task.action_high + task.action_low)
         self._reach = 0.5 * (task.action_high - task.action_low)
@@ -80,14 +117,12 @@ class DynamicsPolicy:
     def __call__(self, observation: Array, /) -> Array:
         """Return the first action of the best plan found from here."""
         state = np.asarray(observation[self._indices], dtype=np.float64)
-        action: Array = self._middle + self._reach * self.planner(state)
+        action: Array = self._middle + self._reach * self.planner(self.known.circles.unroll(state))
         return action
 
     def arrays(self) -> dict[str, Array]:
         """Return the model, the cost and the settings."""
-        model = {_MODEL + name: values for name, values in self.planner.model._asdict().items()}
-        cost = {name: np.array(getattr(self._cost, name)) for name in ("goal", "weights", "limits")}
-        return {**model, **cost, "settings": self._settings}
+        return {**self.known.arrays(), "settings": self._settings}
 
 
 @LEARNERS.register("dynamics")
@@ -118,45 +153,91 @@ class Dynamics:
             If the task has no cost as a function, an action without limits, or there are too few
             transitions to learn from.
         """
-        cost = _cost_of_state(task)
-        attempts = [*evidence.demonstrations, *map(self._worth_learning, evidence.trials)]
-        model = ForwardModel.fit(
-            [(t.select(task.state), t.actions) for t in attempts],
-            task.angles[task.state_indices],
-            task.action_low,
-            task.action_high,
-            rng,
-            n_centres=self.centres,
-        )
-        seed = int(rng.integers(2**32))
-        return DynamicsPolicy(task, model.compiled(), cost, self.horizon, seed)
+        learned = learn_dynamics(task, evidence, rng, self.centres, self.trial_seconds)
+        known = Known(learned.circles, learned.model.compiled(), learned.cost)
+        return DynamicsPolicy(task, known, self.horizon, int(rng.integers(2**32)))
 
     @staticmethod
     def restore(task: Task, arrays: Mapping[str, Array]) -> DynamicsPolicy:
         """Return the policy that `DynamicsPolicy.arrays` described."""
-        values = [
-            np.ascontiguousarray(arrays[_MODEL + name], dtype=_MODEL_TYPES.get(name, np.float64))
-            for name in Model._fields
-        ]
-        goal, weights, limits = (
-            tuple(arrays[name].astype(np.float64)) for name in ("goal", "weights", "limits")
-        )
         horizon, seed = (int(setting) for setting in arrays["settings"])
-        return DynamicsPolicy(task, Model(*values), StateCost(goal, weights, limits), horizon, seed)
+        return DynamicsPolicy(task, Known.restore(task, arrays), horizon, seed)
 
-    def _worth_learning(self, trial: Trajectory) -> Trajectory:
-        """Leave out what a failed trial did long after it could still have succeeded."""
-        steps = max(1, round(self.trial_seconds / trial.dt))
-        long = trial.outcome is Outcome.FAILURE and trial.n_steps > steps
-        return trial.cut(steps) if long else trial
+
+def restored_circles(task: Task, arrays: Mapping[str, Array]) -> Circles:
+    """Return the circles that were kept as the array ``circles``.
+
+    Raises
+    ------
+    MisstepError
+        If they are no pairs of the state's columns.
+    """
+    n, pairs = len(task.state), np.asarray(arrays["circles"], dtype=np.int64)
+    if pairs.ndim != 2 or len(pairs) != 2 or len(set(pairs.flat) & {*range(n)}) < pairs.size:
+        raise MisstepError(
+            f"the policy's circles are {pairs.tolist()}: they must be two rows of distinct "
+            f"columns, from 0 to {n - 1}"
+        )
+    return Circles(n, *pairs)
+
+
+class Learned(NamedTuple):
+    """What all attempts say of a system."""
+
+    circles: Circles
+    model: ForwardModel
+    cost: StateCost
+    """Of the unrolled state."""
+    recordings: list[Recording]
+    """Unrolled, and what the model was fitted on."""
+
+
+def learn_dynamics(
+    task: Task, evidence: Evidence, rng: np.random.Generator, centres: int, trial_seconds: float
+) -> Learned:
+    """Learn how the system responds from all attempts, of failed trials from their start.
+
+    Parameters
+    ----------
+    task : Task
+    evidence : Evidence
+    rng : numpy.random.Generator
+    centres : int
+        Most centres of the sparse Gaussian process.
+    trial_seconds : float, s
+        How much of a failed trial is learned from: long after its start it could not have
+        succeeded any more.
+
+    Raises
+    ------
+    MisstepError
+        If the task has no cost as a function, an action without limits, or there are too few
+        transitions to learn from.
+    """
+    cost = _cost_of_state(task)
+    trials = (_start_of(trial, trial_seconds) for trial in evidence.trials)
+    attempts = [(t.select(task.state), t.actions) for t in (*evidence.demonstrations, *trials)]
+    circles = Circles.find(np.concatenate([states for states, _ in attempts]), cost)
+    recordings = [(circles.unroll(states), actions) for states, actions in attempts]
+    angles = task.angles[task.state_indices][circles.kept] | circles.angles
+    model = ForwardModel.fit(
+        recordings, angles, task.action_low, task.action_high, rng, n_centres=centres
+    )
+    return Learned(circles, model, circles.unroll_cost(cost), recordings)
+
+
+def _start_of(trial: Trajectory, seconds: float) -> Trajectory:
+    steps = max(1, round(seconds / trial.dt))
+    long = trial.outcome is Outcome.FAILURE and trial.n_steps > steps
+    return trial.cut(steps) if long else trial
 
 
 def _cost_of_state(task: Task) -> StateCost:
     """Return the task's cost, of the state's columns alone."""
     if task.cost is None:
         raise MisstepError(
-            "dynamics needs a cost as a function of the observation (rung 4): give the system a "
-            "cost, for example StateCost(goal, weights, limits)"
+            "learning the dynamics needs a cost as a function of the observation (rung 4): give "
+            "the system a cost, for example StateCost(goal, weights, limits)"
         )
     n = len(task.observation_columns)
     goal, weights, limits = task.cost.goal, task.cost.weights, task.cost.limits
