@@ -156,3 +156,23 @@ def test_refuses_a_state_of_another_kind(refused, state):
     mixture = GaussianMixture.from_parameters([1.0], np.zeros((1, 3)), [np.eye(3)])
     with refused("a state here is 2 finite numbers, got"):
         mixture.condition([0, 1], state)
+
+
+@given(seed=SEEDS, K=st.integers(1, 4), n=st.integers(1, 3), d=st.integers(1, 2))
+def test_many_states_are_one_after_the_other(random_mixture, seed, K, n, d):
+    rng = np.random.default_rng(seed)
+    mixture = GaussianMixture.from_parameters(*random_mixture(rng, K, n + d))
+    conditioner = Conditioner(mixture, range(n))
+    states = 3.0 * rng.normal(size=(6, n))
+    h, m = conditioner.at_each(states)
+    for i, state in enumerate(states):
+        one = conditioner.at(state)
+        np.testing.assert_array_equal(h[i], one.weights)
+        np.testing.assert_array_equal(m[i], one.means)
+
+
+def test_many_states_are_checked(refused):
+    mixture = GaussianMixture.from_parameters([1.0], [[0.0, 0.0]], [np.eye(2)])
+    for states in ([0.0], [[0.0, 0.0]], [[np.nan]]):
+        with refused(r"points are finite and have shape \(N, 1\)"):
+            Conditioner(mixture, [0]).at_each(states)

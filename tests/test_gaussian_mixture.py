@@ -10,7 +10,7 @@ from sklearn.exceptions import NotFittedError
 from sklearn.utils.estimator_checks import check_estimator
 from threadpoolctl import threadpool_limits
 
-from misstep.mixture import GaussianMixture, compiled, reference
+from misstep.mixture import GaussianMixture, reference
 
 SEEDS = st.integers(0, 2**32 - 1)
 may_stop_early = pytest.mark.filterwarnings(
@@ -155,81 +155,6 @@ def test_bic_with_weights_uses_kish_s_effective_size(random_mixture):
     assert mixture.bic(X, sample_weight=weight) == pytest.approx(expected, rel=1e-12)
     assert mixture.bic(X, sample_weight=7 * weight) == pytest.approx(expected, rel=1e-12)
     assert mixture.bics_[2] == pytest.approx(expected, rel=1e-9)
-
-
-# The compiled loops against the readable ones
-
-
-def arrays_of(weights, means, covariances):
-    K, d = means.shape
-    whiteners, constants = np.empty((K, d, d)), np.empty(K)
-    assert compiled.precompute(weights, covariances, whiteners, constants)
-    return constants, means, whiteners
-
-
-@given(seed=SEEDS, d=st.integers(1, 5), K=st.integers(1, 4), n=st.integers(1, 600))
-def test_one_iteration_against_the_reference(random_mixture, seed, d, K, n):
-    rng = np.random.default_rng(seed)
-    weights, means, covariances = random_mixture(rng, K, d)
-    X = samples_of((weights, means, covariances), n, rng)
-    sample_weight = rng.random(n) + 0.1
-    x = np.ascontiguousarray(X.T)
-    constants, _, whiteners = arrays_of(weights, means, covariances)
-    np.testing.assert_allclose(
-        compiled.log_joint(x, constants, means, whiteners),
-        reference.log_joint(X, weights, means, covariances),
-        rtol=1e-9,
-        atol=1e-9,
-    )
-    floor = 1e-3
-    expected = reference.em_step(X, sample_weight, weights, means, covariances, floor)
-    mass, first, second = np.empty(K), np.empty((K, d)), np.empty((K, d, d))
-    log_likelihood = compiled.expectation(
-        x, sample_weight, constants, means, whiteners, mass, first, second
-    )
-    new_weights, new_means, new_covariances = weights.copy(), means.copy(), covariances.copy()
-    compiled.maximisation(mass, first, second, new_means, floor, new_weights, new_covariances)
-    assert log_likelihood == pytest.approx(expected[0], rel=1e-9, abs=1e-9)
-    np.testing.assert_allclose(new_weights, expected[1], rtol=1e-8, atol=1e-12)
-    # A component that no sample claims keeps its place.
-    claimed = mass > 1e-9 * mass.sum()
-    np.testing.assert_allclose(new_means[claimed], expected[2][claimed], rtol=1e-7, atol=1e-7)
-    np.testing.assert_allclose(new_covariances[claimed], expected[3][claimed], rtol=1e-6, atol=1e-6)
-
-
-@given(seed=SEEDS, d=st.integers(1, 4), K=st.integers(1, 4))
-def test_an_iteration_never_lowers_the_likelihood(random_mixture, seed, d, K):
-    rng = np.random.default_rng(seed)
-    X = samples_of(random_mixture(rng, K, d), 150, rng)
-    x, sample_weight = np.ascontiguousarray(X.T), rng.random(150)
-    weights, means, precisions = start_from(X, K, rng)
-    covariances = np.linalg.inv(precisions)
-    whiteners, constants = np.empty((K, d, d)), np.empty(K)
-    mass, first, second = np.empty(K), np.empty((K, d)), np.empty((K, d, d))
-    values = []
-    for _ in range(20):
-        # Without a floor a component may shrink onto a few samples.
-        if not compiled.precompute(weights, covariances, whiteners, constants):
-            break
-        values.append(
-            compiled.expectation(x, sample_weight, constants, means, whiteners, mass, first, second)
-        )
-        compiled.maximisation(mass, first, second, means, 0.0, weights, covariances)
-    assert len(values) > 3
-    assert np.all(np.diff(values) >= -1e-9 * np.abs(values[:-1]))
-
-
-def test_exponential():
-    z = np.concatenate([-np.logspace(-20, math.log10(708), 5000), [0.0, -1.0, -708.0]])
-    for start in range(0, len(z), compiled.BLOCK):
-        block = z[start : start + compiled.BLOCK].copy()
-        out = np.empty(compiled.BLOCK)
-        compiled.exp_block(block.copy(), out, out.view(np.int64), len(block))
-        np.testing.assert_allclose(out[: len(block)], np.exp(block), rtol=1e-15)
-    far = np.array([-709.0, -1e10, -np.inf])
-    out = np.empty(3)
-    compiled.exp_block(far, out, out.view(np.int64), 3)
-    np.testing.assert_allclose(out, np.exp(-708.0), rtol=1e-15)
 
 
 # What a fitted mixture says

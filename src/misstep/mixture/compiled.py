@@ -1,237 +1,68 @@
-"""The compiled loops: expectation–maximisation, and "which action now?".
+"""The compiled loops that answer "which action now?".
 
 Everything here takes plain float64 arrays that the callers have validated. `reference.py` says the
 same in readable NumPy, and the tests hold the two against each other.
 
-Two rules of speed shape the code. Expectation–maximisation walks the data in blocks that stay in
-cache, with the sample index innermost, so that every loop vectorises; the exponential is a
-polynomial, because calling ``exp`` once a sample would not. A query answers one state without
-allocating more than a few small arrays.
-
-Fast-math is limited to re-ordering (`REORDER`), so infinities and NaN keep their meaning. What uses
-it is inlined by force into callers that do not: left to itself, the process that compiles runs the
-stand-alone copy and later ones the copy in the caller's cache, whose last bits differ.
+A query allocates nothing: it works in one array that the caller brings (`scratch_for`). Components
+too far away to change the last bit of a density are passed over, which in a mixture of ten leaves
+two or three.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+from misstep.mixture.elementary import CONTRACT, exp_nonpositive
+
+Array = NDArray[np.float64]
 
 REORDER = {"reassoc", "contract", "nsz", "arcp"}
-CONTRACT = {"contract"}
-BLOCK = 256
+_COMPILED: dict[str, Any] = {"cache": True, "nogil": True, "_nrt": False}
+_INLINED: dict[str, Any] = {"forceinline": True, "_nrt": False}
 LOG_2PI = math.log(2.0 * math.pi)
-
-# Adding 1.5·2⁵² to a small whole double leaves that whole number in the low bits of the sum.
-_TO_LOW_BITS = 6755399441055744.0
-_LOG2_E = 1.4426950408889634
-_LN2_HIGH = 0.693147180369123816490
-_LN2_LOW = 1.90821492927058770002e-10
 
 
 @njit(fastmath=CONTRACT, forceinline=True)
 def exp_block(z, out, bits, count):
-    """Write exp(z) into `out` for the first `count` entries; z ≤ 0; below −708 it gives exp(−708).
-
-    `bits` is the int64 view of `out`. Cody–Waite reduction and a Taylor polynomial of degree 12:
-    relative error below 1e-15. `REORDER` would undo the reduction, and a function that states no
-    fast-math of its own would inherit it from whichever caller is compiled first.
-    """
+    """Write exp(z) into `out` for the first `count` entries; z ≤ 0; see `exp_nonpositive`."""
     for i in range(count):
-        v = max(z[i], -708.0)
-        n = math.floor(v * _LOG2_E + 0.5)
-        r = (v - n * _LN2_HIGH) - n * _LN2_LOW
-        p = 1.0 / 479001600.0
-        p = p * r + 1.0 / 39916800.0
-        p = p * r + 1.0 / 3628800.0
-        p = p * r + 1.0 / 362880.0
-        p = p * r + 1.0 / 40320.0
-        p = p * r + 1.0 / 5040.0
-        p = p * r + 1.0 / 720.0
-        p = p * r + 1.0 / 120.0
-        p = p * r + 1.0 / 24.0
-        p = p * r + 1.0 / 6.0
-        p = p * r + 0.5
-        p = p * r + 1.0
-        p = p * r + 1.0
-        z[i] = p
-        out[i] = n + _TO_LOW_BITS
-    for i in range(count):
-        bits[i] = (bits[i] + 1023) << 52
-    for i in range(count):
-        out[i] *= z[i]
+        out[i] = exp_nonpositive(z[i])
 
 
-@njit(cache=True)
+@njit(**_COMPILED)
 def cholesky_whitener(covariance, whitener):
     """Fill `whitener` with W = L⁻¹ of L Lᵀ = `covariance`; return log det W or NaN."""
     d = covariance.shape[0]
-    lower = np.zeros((d, d))
     log_det = 0.0
     for i in range(d):
         for j in range(i + 1):
             s = covariance[i, j]
             for m in range(j):
-                s -= lower[i, m] * lower[j, m]
+                s -= whitener[i, m] * whitener[j, m]
             if i > j:
-                lower[i, j] = s / lower[j, j]
+                whitener[i, j] = s / whitener[j, j]
             elif s > 0.0:
-                lower[i, i] = math.sqrt(s)
-                log_det -= math.log(lower[i, i])
+                whitener[i, i] = math.sqrt(s)
+                log_det -= math.log(whitener[i, i])
             else:
                 return np.nan
+    # L is inverted in place: a column of it is read for the last time where it is overwritten.
     for j in range(d):
-        for i in range(d):
+        for i in range(j):
             whitener[i, j] = 0.0
-        whitener[j, j] = 1.0 / lower[j, j]
+        whitener[j, j] = 1.0 / whitener[j, j]
         for i in range(j + 1, d):
             s = 0.0
             for m in range(j, i):
-                s -= lower[i, m] * whitener[m, j]
-            whitener[i, j] = s / lower[i, i]
+                s -= whitener[i, m] * whitener[m, j]
+            whitener[i, j] = s / whitener[i, i]
     return log_det
 
 
-@njit(fastmath=REORDER, forceinline=True)
-def _squared_distances(x, start, count, mean, whitener, q, row):
-    """q[b] = Mahalanobis² of samples start..start+count of x (d, N) from `mean`."""
-    d = x.shape[0]
-    for b in range(count):
-        q[b] = 0.0
-    for i in range(d):
-        offset = 0.0
-        for j in range(i + 1):
-            offset -= whitener[i, j] * mean[j]
-        for b in range(count):
-            row[b] = offset
-        for j in range(i + 1):
-            c = whitener[i, j]
-            xj = x[j, start : start + count]
-            for b in range(count):
-                row[b] += c * xj[b]
-        for b in range(count):
-            q[b] += row[b] * row[b]
-
-
-@njit(fastmath=REORDER, forceinline=True)
-def _accumulate(x, start, count, mean, r, deviations, mass, first, second):
-    """Add the block's moments about `mean` to `first` (d,) and `second` (d, d); return the mass."""
-    d = x.shape[0]
-    for b in range(count):
-        mass += r[b]
-    for j in range(d):
-        xj = x[j, start : start + count]
-        mj = mean[j]
-        dev = deviations[j]
-        for b in range(count):
-            dev[b] = xj[b] - mj
-    for j in range(d):
-        dev = deviations[j]
-        weighted = deviations[d]
-        s = 0.0
-        for b in range(count):
-            weighted[b] = r[b] * dev[b]
-            s += weighted[b]
-        first[j] += s
-        for m in range(j + 1):
-            other = deviations[m]
-            s = 0.0
-            for b in range(count):
-                s += weighted[b] * other[b]
-            second[j, m] += s
-    return mass
-
-
-@njit(fastmath=REORDER, forceinline=True)
-def expectation(x, sample_weight, constants, means, whiteners, mass, first, second):
-    """One pass over the data: weighted log-likelihood, and each component's moments about its mean.
-
-    Parameters
-    ----------
-    x : ndarray, shape (d, N)
-    sample_weight : ndarray, shape (N,)
-    constants : ndarray, shape (K,)
-        log π_k + log det W_k − d/2 log 2π.
-    means, whiteners : ndarray, shapes (K, d) and (K, d, d)
-    mass, first, second : ndarray, shapes (K,), (K, d), (K, d, d)
-        Overwritten.
-    """
-    d, n = x.shape
-    n_components = constants.shape[0]
-    log_p = np.empty((n_components, BLOCK))
-    scratch = np.empty(BLOCK)
-    top = np.empty(BLOCK)
-    total = np.empty(BLOCK)
-    p = np.empty((n_components, BLOCK))
-    bits = p.view(np.int64)
-    deviations = np.empty((d + 1, BLOCK))
-    mass[:] = 0.0
-    first[:] = 0.0
-    second[:] = 0.0
-    log_likelihood = 0.0
-    for start in range(0, n, BLOCK):
-        count = min(BLOCK, n - start)
-        for k in range(n_components):
-            lp = log_p[k]
-            _squared_distances(x, start, count, means[k], whiteners[k], lp, scratch)
-            c = constants[k]
-            if k == 0:
-                for b in range(count):
-                    lp[b] = c - 0.5 * lp[b]
-                    top[b] = lp[b]
-            else:
-                for b in range(count):
-                    lp[b] = c - 0.5 * lp[b]
-                    top[b] = max(top[b], lp[b])
-        for b in range(count):
-            total[b] = 0.0
-        for k in range(n_components):
-            lp = log_p[k]
-            for b in range(count):
-                lp[b] -= top[b]
-            exp_block(lp, p[k], bits[k], count)
-            pk = p[k]
-            for b in range(count):
-                total[b] += pk[b]
-        w = sample_weight[start : start + count]
-        for b in range(count):
-            log_likelihood += w[b] * (top[b] + math.log(total[b]))
-            total[b] = w[b] / total[b]
-        for k in range(n_components):
-            pk = p[k]
-            for b in range(count):
-                pk[b] *= total[b]
-            mass[k] = _accumulate(
-                x, start, count, means[k], pk, deviations, mass[k], first[k], second[k]
-            )
-    return log_likelihood
-
-
-@njit(cache=True)
-def maximisation(mass, first, second, means, floor, weights, covariances):
-    """Turn moments about the old means into the new weights, means and covariances, in place."""
-    n_components, d = means.shape
-    total = 0.0
-    for k in range(n_components):
-        total += mass[k]
-    for k in range(n_components):
-        weights[k] = mass[k] / total
-        # A component that no sample claims keeps its place: dividing by its mass would be 0/0.
-        if mass[k] <= 1e-12 * total:
-            continue
-        for j in range(d):
-            first[k, j] /= mass[k]
-        for j in range(d):
-            for m in range(j + 1):
-                s = second[k, j, m] / mass[k] - first[k, j] * first[k, m]
-                covariances[k, j, m] = s
-                covariances[k, m, j] = s
-            covariances[k, j, j] += floor
-            means[k, j] += first[k, j]
-
-
-@njit(cache=True)
+@njit(**_COMPILED)
 def precompute(weights, covariances, whiteners, constants):
     """Fill `whiteners` (K, d, d) and `constants` (K,); False if a covariance is not definite."""
     d = covariances.shape[1]
@@ -243,61 +74,43 @@ def precompute(weights, covariances, whiteners, constants):
     return True
 
 
-@njit(cache=True)
-def fit_em(x, sample_weight, weights, means, covariances, floor, tol, max_iter):
-    """Run expectation–maximisation from the given start, which is overwritten by the result.
-
-    Stops when the mean log-likelihood per unit of weight rises by less than `tol`, or after
-    `max_iter` iterations.
-
-    Returns
-    -------
-    log_likelihood : float
-        Weighted log-likelihood of the returned parameters; NaN if a covariance collapsed.
-    n_iter : int
-    converged : bool
-    """
-    n_components, d = means.shape
-    whiteners = np.empty((n_components, d, d))
-    constants = np.empty(n_components)
-    mass = np.empty(n_components)
-    first = np.empty((n_components, d))
-    second = np.empty((n_components, d, d))
-    total_weight = sample_weight.sum()
-    previous = -np.inf
-    for iteration in range(max_iter + 1):
-        if not precompute(weights, covariances, whiteners, constants):
-            return np.nan, iteration, False
-        log_likelihood = expectation(
-            x, sample_weight, constants, means, whiteners, mass, first, second
-        )
-        if abs(log_likelihood - previous) < tol * total_weight:
-            return log_likelihood, iteration, True
-        if iteration == max_iter:
-            break
-        previous = log_likelihood
-        maximisation(mass, first, second, means, floor, weights, covariances)
-    return log_likelihood, max_iter, False
+# What adds less than exp(−45) of a sum would not change its last bit, however many do.
+NEGLIGIBLE = 45.0
 
 
-@njit(cache=True)
-def log_joint(x, constants, means, whiteners):
-    """Return log π_k N(x_i; μ_k, Σ_k), shape (N, K), for samples x of shape (d, N)."""
-    n = x.shape[1]
-    n_components = constants.shape[0]
-    out = np.empty((n, n_components))
-    q = np.empty(BLOCK)
-    row = np.empty(BLOCK)
-    for start in range(0, n, BLOCK):
-        count = min(BLOCK, n - start)
-        for k in range(n_components):
-            _squared_distances(x, start, count, means[k], whiteners[k], q, row)
-            for b in range(count):
-                out[start + b, k] = constants[k] - 0.5 * q[b]
-    return out
+def scratch_for(K: int, d: int) -> NDArray[np.float64]:
+    """Return the room that a query of K components and d actions works in."""
+    return np.empty(K * (3 + 2 * d) + 6 * d + 3 * d * d)
 
 
-@njit(cache=True)
+@njit(inline="always", _nrt=False)
+def _component_rooms(scratch, n_components, d):
+    """h, value and slope (K,), m and direction (K, d)."""
+    a, b = 3 * n_components, n_components * d
+    return (
+        scratch[:n_components],
+        scratch[n_components : 2 * n_components],
+        scratch[2 * n_components : a],
+        scratch[a : a + b].reshape((n_components, d)),
+        scratch[a + b : a + 2 * b].reshape((n_components, d)),
+    )
+
+
+@njit(inline="always", _nrt=False)
+def _vector_room(scratch, n_components, d, i):
+    """One of six vectors (d,)."""
+    begin = n_components * (3 + 2 * d) + i * d
+    return scratch[begin : begin + d]
+
+
+@njit(inline="always", _nrt=False)
+def _matrix_room(scratch, n_components, d, i):
+    """One of three matrices (d, d)."""
+    begin = n_components * (3 + 2 * d) + 6 * d + i * d * d
+    return scratch[begin : begin + d * d].reshape((d, d))
+
+
+@njit(**_COMPILED)
 def condition(state, constants, state_means, whiteners, gains, action_means, h, m):
     """Gaussian mixture regression at one state: fill h (K,) and the conditional means m (K, d)."""
     n_components, n = state_means.shape
@@ -324,7 +137,14 @@ def condition(state, constants, state_means, whiteners, gains, action_means, h, 
         h[k] /= total
 
 
-@njit(cache=True)
+@njit(**_COMPILED)
+def conditions(states, constants, state_means, whiteners, gains, action_means, h, m):
+    """`condition` at many states (N, n): fill h (N, K) and m (N, K, d)."""
+    for i in range(states.shape[0]):
+        condition(states[i], constants, state_means, whiteners, gains, action_means, h[i], m[i])
+
+
+@njit(**_COMPILED)
 def scaled_variance(h, m, covariances, scale):
     """‖V‖/s² = tr(V/s²)/d, the spread of the conditional mixture in units of `scale` (d,)."""
     n_components, d = m.shape
@@ -341,9 +161,10 @@ def scaled_variance(h, m, covariances, scale):
     return total / d
 
 
-@njit(cache=True)
-def donut_log_density(squared, log_norm, gamma, r_alpha, r_beta, d):
-    """Return log D at Mahalanobis² `squared`, and the factor g in ∇ log D = g Σ⁻¹(a − μ)."""
+@njit(**_INLINED)
+def _donut_terms(shape, d):
+    """r_α², r_β² − r_α², (γ − 1) kᵈ, the density at the centre in units of N, and d log r_α."""
+    gamma, r_alpha, r_beta = shape
     a2 = r_alpha * r_alpha
     gap = r_beta * r_beta - a2
     ratio = (r_beta / r_alpha) ** d
@@ -352,28 +173,37 @@ def donut_log_density(squared, log_norm, gamma, r_alpha, r_beta, d):
     # At full exploration the centre is zero; what rounding leaves there would be a false floor.
     if abs(centre) < 1e-14 * gamma + 4e-16 * ratio:
         centre = 0.0
+    return a2, gap, inner, centre, d * math.log(r_alpha)
+
+
+@njit(**_INLINED)
+def _log_donut(squared, log_norm, terms):
+    """Return log D at Mahalanobis² `squared`, and the factor g in ∇ log D = g Σ⁻¹(a − μ)."""
+    a2, gap, inner, centre, log_width = terms
     # expm1 keeps the bracket exact next to the centre, where it may vanish.
-    bracket = centre - inner * math.expm1(-0.5 * squared * gap)
+    rise = math.expm1(-0.5 * squared * gap)
+    bracket = centre - inner * rise
     if bracket <= 0.0:
         return -np.inf, 0.0
-    slope = inner * math.exp(-0.5 * squared * gap) * gap / bracket - a2
-    value = log_norm + d * math.log(r_alpha) - 0.5 * a2 * squared + math.log(bracket)
-    return value, slope
+    slope = inner * (rise + 1.0) * gap / bracket - a2
+    return log_norm + log_width - 0.5 * a2 * squared + math.log(bracket), slope
 
 
-@njit(cache=True)
-def mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, metric):
-    """Return log DMM(a); fill its gradient (d,) and the metric (d, d), the mean precision there.
+@njit(**_COMPILED)
+def donut_log_density(squared, log_norm, gamma, r_alpha, r_beta, d):
+    """Return log D at Mahalanobis² `squared`, and the factor g in ∇ log D = g Σ⁻¹(a − μ)."""
+    return _log_donut(squared, log_norm, _donut_terms((gamma, r_alpha, r_beta), d))
 
-    `shape` holds γ, r_α, r_β. Where the density is zero the gradient is zero and the metric the
-    first component's.
+
+@njit(**_INLINED)
+def _log_donuts(a, log_h, m, whiteners, log_norms, shape, value, slope, direction, y):
+    """Fill each component's log h_k D_k(a) and what its gradient is made of; return the largest.
+
+    Components passed over get −∞.
     """
     n_components, d = m.shape
-    gamma, r_alpha, r_beta = shape
-    y = np.empty(d)
-    direction = np.empty((n_components, d))
-    value = np.empty(n_components)
-    slope = np.empty(n_components)
+    terms = _donut_terms(shape, d)
+    most = terms[4] + math.log(shape[0])
     top = -np.inf
     for k in range(n_components):
         squared = 0.0
@@ -386,9 +216,26 @@ def mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, metric):
             direction[k, j] = 0.0
             for i in range(j, d):
                 direction[k, j] += whiteners[k, i, j] * y[i]
-        v, slope[k] = donut_log_density(squared, log_norms[k], gamma, r_alpha, r_beta, d)
+        if log_h[k] + log_norms[k] + most - 0.5 * terms[0] * squared < top - NEGLIGIBLE:
+            value[k], slope[k] = -np.inf, 0.0
+            continue
+        v, slope[k] = _log_donut(squared, log_norms[k], terms)
         value[k] = log_h[k] + v
         top = max(top, value[k])
+    return top
+
+
+@njit(**_COMPILED)
+def mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, metric, scratch):
+    """Return log DMM(a); fill its gradient (d,) and the metric (d, d), the mean precision there.
+
+    `shape` holds γ, r_α, r_β. Where the density is zero the gradient is zero and the metric the
+    first component's.
+    """
+    n_components, d = m.shape
+    _, value, slope, _, direction = _component_rooms(scratch, n_components, d)
+    y = _vector_room(scratch, n_components, d, 0)
+    top = _log_donuts(a, log_h, m, whiteners, log_norms, shape, value, slope, direction, y)
     for i in range(d):
         gradient[i] = 0.0
         for j in range(d):
@@ -396,10 +243,17 @@ def mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, metric):
     silent = top == -np.inf
     total = 0.0
     for k in range(n_components):
-        value[k] = (1.0 if k == 0 else 0.0) if silent else math.exp(value[k] - top)
+        if silent:
+            value[k] = 1.0 if k == 0 else 0.0
+        elif value[k] < top - NEGLIGIBLE:
+            value[k] = 0.0
+        else:
+            value[k] = math.exp(value[k] - top)
         total += value[k]
     for k in range(n_components):
         rho = value[k] / total
+        if rho == 0.0:
+            continue
         for i in range(d):
             gradient[i] += rho * slope[k] * direction[k, i]
             for j in range(d):
@@ -408,27 +262,25 @@ def mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, metric):
     return top + math.log(total)
 
 
-@njit(cache=True)
-def mixture_densities(points, log_h, m, whiteners, log_norms, shape, values, gradients):
+@njit(**_COMPILED)
+def mixture_densities(points, log_h, m, whiteners, log_norms, shape, values, gradients, scratch):
     """`mixture_density` at many points (N, d): fill `values` (N,) and `gradients` (N, d)."""
-    d = points.shape[1]
-    metric = np.empty((d, d))
+    n_components, d = m.shape
+    metric = _matrix_room(scratch, n_components, d, 0)
     for i in range(points.shape[0]):
         values[i] = mixture_density(
-            points[i], log_h, m, whiteners, log_norms, shape, gradients[i], metric
+            points[i], log_h, m, whiteners, log_norms, shape, gradients[i], metric, scratch
         )
 
 
-@njit(cache=True)
-def solve_definite(matrix, right, out):
+@njit(**_COMPILED)
+def solve_definite(matrix, right, out, whitener, y):
     """Solve `matrix` · out = `right` for a positive definite matrix (d, d)."""
     d = matrix.shape[0]
     if d == 1:
         out[0] = right[0] / matrix[0, 0]
         return
-    whitener = np.empty((d, d))
     cholesky_whitener(matrix, whitener)
-    y = np.empty(d)
     for i in range(d):
         y[i] = 0.0
         for j in range(i + 1):
@@ -445,8 +297,8 @@ NUDGE = 1e-3
 MAX_ASCENT = 500
 
 
-@njit(cache=True)
-def ascend(a, log_h, m, whiteners, log_norms, shape):
+@njit(**_COMPILED)
+def ascend(a, log_h, m, whiteners, log_norms, shape, scratch):
     """Climb from `a` (overwritten) to a local maximum of the donut mixture; return its log density.
 
     Gradient ascent in the metric of the components that matter where it stands, with backtracking.
@@ -455,27 +307,29 @@ def ascend(a, log_h, m, whiteners, log_norms, shape):
     although the centre may be a pit: a start without a slope is moved by a thousandth of a standard
     deviation.
     """
-    d = m.shape[1]
-    gradient = np.empty(d)
-    metric = np.empty((d, d))
-    step = np.empty(d)
-    trial = np.empty(d)
-    trial_gradient = np.empty(d)
-    trial_metric = np.empty((d, d))
-    value = mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, metric)
-    solve_definite(metric, gradient, step)
+    n_components, d = m.shape
+    y = _vector_room(scratch, n_components, d, 0)
+    gradient = _vector_room(scratch, n_components, d, 1)
+    step = _vector_room(scratch, n_components, d, 2)
+    trial = _vector_room(scratch, n_components, d, 3)
+    trial_gradient = _vector_room(scratch, n_components, d, 4)
+    metric = _matrix_room(scratch, n_components, d, 0)
+    trial_metric = _matrix_room(scratch, n_components, d, 1)
+    whitener = _matrix_room(scratch, n_components, d, 2)
+    value = mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, metric, scratch)
+    solve_definite(metric, gradient, step, whitener, y)
     squared = 0.0
     for i in range(d):
         squared += step[i] * gradient[i]
     if squared < SHORTEST_STEP**2:
         for i in range(d):
             a[i] += NUDGE / math.sqrt(metric[i, i])
-        value = mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, metric)
+        value = mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, metric, scratch)
     length = 1.0
     for _ in range(MAX_ASCENT):
         if value == -np.inf:
             break
-        solve_definite(metric, gradient, step)
+        solve_definite(metric, gradient, step, whitener, y)
         squared = 0.0
         for i in range(d):
             squared += step[i] * gradient[i]
@@ -485,11 +339,20 @@ def ascend(a, log_h, m, whiteners, log_norms, shape):
         # In units of the slope: a longer last step may have become too short where it is gentler.
         length = max(length, min(1.0, 10.0 * SHORTEST_STEP / norm))
         length = min(length, max(LONGEST_STEP, 0.25 * norm - 2.0) / norm)
+        trial_value = -np.inf
         while length * norm >= SHORTEST_STEP:
             for i in range(d):
                 trial[i] = a[i] + length * step[i]
             trial_value = mixture_density(
-                trial, log_h, m, whiteners, log_norms, shape, trial_gradient, trial_metric
+                trial,
+                log_h,
+                m,
+                whiteners,
+                log_norms,
+                shape,
+                trial_gradient,
+                trial_metric,
+                scratch,
             )
             if trial_value >= value + 0.1 * length * squared:
                 break
@@ -501,20 +364,22 @@ def ascend(a, log_h, m, whiteners, log_norms, shape):
         for i in range(d):
             curvature += length * step[i] * (gradient[i] - trial_gradient[i])
         length = length * length * squared / curvature if curvature > 0.0 else 2.0 * length
-        a[:] = trial
         value = trial_value
-        gradient[:] = trial_gradient
-        metric[:] = trial_metric
+        for i in range(d):
+            a[i] = trial[i]
+            gradient[i] = trial_gradient[i]
+            for j in range(d):
+                metric[i, j] = trial_metric[i, j]
     return value
 
 
-@njit(cache=True)
-def best_candidate(a, log_h, m, whiteners, lowers, log_norms, shape, ridge):
+@njit(**_COMPILED)
+def best_candidate(a, log_h, m, whiteners, lowers, log_norms, shape, ridge, scratch):
     """Overwrite `a` with the densest of the centres and the points on each component's ridge."""
     n_components, d = m.shape
-    gradient = np.empty(d)
-    metric = np.empty((d, d))
-    candidate = np.empty(d)
+    _, value, slope, _, direction = _component_rooms(scratch, n_components, d)
+    y = _vector_room(scratch, n_components, d, 0)
+    candidate = _vector_room(scratch, n_components, d, 3)
     best = -np.inf
     for k in range(n_components):
         for c in range(2 * d + 1):
@@ -522,15 +387,25 @@ def best_candidate(a, log_h, m, whiteners, lowers, log_norms, shape, ridge):
             sign = 0.0 if c == 0 else (1.0 if c % 2 == 1 else -1.0)
             for i in range(d):
                 candidate[i] = m[k, i] + sign * ridge * lowers[k, i, max(axis, 0)]
-            value = mixture_density(
-                candidate, log_h, m, whiteners, log_norms, shape, gradient, metric
+            top = _log_donuts(
+                candidate, log_h, m, whiteners, log_norms, shape, value, slope, direction, y
             )
-            if value > best or (k == 0 and c == 0):
-                best = value
-                a[:] = candidate
+            # The sum is at most K times its largest term.
+            if top + math.log(n_components) < best or top == -np.inf:
+                density = top
+            else:
+                total = 0.0
+                for i in range(n_components):
+                    if value[i] >= top - NEGLIGIBLE:
+                        total += math.exp(value[i] - top)
+                density = top + math.log(total)
+            if density > best or (k == 0 and c == 0):
+                best = density
+                for i in range(d):
+                    a[i] = candidate[i]
 
 
-@njit(cache=True)
+@njit(**_COMPILED)
 def donut_shape(exploration, d, k, reach):
     """γ, r_α, r_β of the exploration family, and the Mahalanobis radius of its ridge (0: none)."""
     r_alpha = 1.0 / (1.0 + (reach - 1.0) * exploration)
@@ -543,8 +418,8 @@ def donut_shape(exploration, d, k, reach):
     return (gamma, r_alpha, r_beta), ridge
 
 
-@njit(cache=True)
-def explore(
+@njit(**_COMPILED)
+def answer(
     state,
     action,
     warm,
@@ -562,6 +437,7 @@ def explore(
     whiteners,
     lowers,
     log_norms,
+    scratch,
 ):
     """Condition on `state`, choose ε, climb the donut mixture; overwrite `action`, return ε.
 
@@ -570,8 +446,7 @@ def explore(
     precision. `printed` takes ε = 1/(1 + V/s²), the paper's formula as printed.
     """
     n_components, d = action_means.shape
-    h = np.empty(n_components)
-    m = np.empty((n_components, d))
+    h, _, _, m, _ = _component_rooms(scratch, n_components, d)
     condition(state, state_constants, state_means, state_whiteners, gains, action_means, h, m)
     spread = scaled_variance(h, m, covariances, scale)
     exploration = 1.0 / (1.0 + spread) if printed else spread / (1.0 + spread)
@@ -579,11 +454,24 @@ def explore(
     for i in range(n_components):
         h[i] = math.log(max(h[i], 1e-300))
     if not warm:
-        best_candidate(action, h, m, whiteners, lowers, log_norms, shape, ridge)
+        best_candidate(action, h, m, whiteners, lowers, log_norms, shape, ridge, scratch)
     elif flat_stays:
-        gradient, metric = np.empty(d), np.empty((d, d))
-        value = mixture_density(action, h, m, whiteners, log_norms, shape, gradient, metric)
+        gradient = _vector_room(scratch, n_components, d, 1)
+        metric = _matrix_room(scratch, n_components, d, 0)
+        value = mixture_density(
+            action, h, m, whiteners, log_norms, shape, gradient, metric, scratch
+        )
         if math.exp(value) == 0.0:
             return exploration
-    ascend(action, h, m, whiteners, log_norms, shape)
+    ascend(action, h, m, whiteners, log_norms, shape, scratch)
+    return exploration
+
+
+def explore(
+    state: Array, action: Array, warm: bool, flat_stays: bool, printed: bool, *rest: Any
+) -> float:
+    """`answer` for callers that bring no scratch."""
+    exploration: float = answer(
+        state, action, warm, flat_stays, printed, *rest, scratch_for(len(rest[-1]), len(action))
+    )
     return exploration

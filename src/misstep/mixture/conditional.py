@@ -18,6 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from misstep.errors import MisstepError
 from misstep.mixture import compiled
+from misstep.mixture.checks import checked_points
 
 if TYPE_CHECKING:
     from misstep.mixture.gaussian_mixture import GaussianMixture
@@ -114,3 +115,28 @@ class Conditioner:
             m,
         )
         return Conditional(h, m, self.covariances)
+
+    def at_each(self, states: ArrayLike) -> tuple[Array, Array]:
+        """Return the weights (N, K) and means (N, K, d) at many states (N, n).
+
+        The covariances, which do not depend on the state, are `covariances`.
+
+        Raises
+        ------
+        MisstepError
+            If `states` has another shape or is not finite.
+        """
+        x = checked_points(states, self.state_means.shape[1])
+        h = np.empty((len(x), len(self.gains)))
+        m = np.empty((len(x), *self.action_means.shape))
+        compiled.conditions(
+            x,
+            self.state_constants,
+            self.state_means,
+            self.state_whiteners,
+            self.gains,
+            self.action_means,
+            h,
+            m,
+        )
+        return h, m

@@ -90,6 +90,7 @@ class DonutMixture:
         self.ridge_radius = compiled.donut_shape(self.exploration, d, float(k), float(reach))[1]
         self._log_h = np.log(np.maximum(conditional.weights, 1e-300))
         self._components = component_arrays(conditional.covariances)
+        self._scratch = compiled.scratch_for(*conditional.means.shape)
 
     def log_pdf(self, a: ArrayLike) -> Array:
         """Return the log density at points of shape (N, d), shape (N,); −inf where it is zero."""
@@ -121,11 +122,19 @@ class DonutMixture:
         if start is None:
             a = np.empty(means.shape[1])
             compiled.best_candidate(
-                a, self._log_h, means, whiteners, lowers, log_norms, self.shape, self.ridge_radius
+                a,
+                self._log_h,
+                means,
+                whiteners,
+                lowers,
+                log_norms,
+                self.shape,
+                self.ridge_radius,
+                self._scratch,
             )
         else:
             a = self._points(np.array(start)[None])[0]
-        compiled.ascend(a, self._log_h, means, whiteners, log_norms, self.shape)
+        compiled.ascend(a, self._log_h, means, whiteners, log_norms, self.shape, self._scratch)
         return a
 
     def _points(self, a: ArrayLike) -> Array:
@@ -145,6 +154,7 @@ class DonutMixture:
             self.shape,
             values,
             gradients,
+            self._scratch,
         )
         return values, gradients
 

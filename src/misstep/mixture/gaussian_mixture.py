@@ -2,8 +2,9 @@
 
 import math
 import warnings
-from collections.abc import Sequence
-from typing import Any, NamedTuple, Self
+from collections.abc import Iterable, Sequence
+from functools import partial
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,14 +13,13 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from misstep.errors import MisstepError
-from misstep.mixture import compiled, starts
+from misstep.mixture import compiled, em, fitting, starts
 from misstep.mixture.checks import are_definite
+from misstep.mixture.chunks import SUBSAMPLE, StandardisedChunks, survey
 from misstep.mixture.conditional import Conditional, Conditioner
+from misstep.mixture.em import Mixture, Rule, Samples
 
 Array = NDArray[np.float64]
-
-# Iterations after which the starts of one K are compared and only the best goes on.
-TRYOUT = 15
 
 
 class Ellipse(NamedTuple):
@@ -57,6 +57,12 @@ class GaussianMixture(DensityMixin, BaseEstimator):
     means_init : array-like, shape (K, d), optional
     precisions_init : array-like, shape (K, d, d), optional
         A start to use instead of k-means++: all three or none, with `n_components` given.
+    start : GaussianMixture, optional
+        A fitted mixture of the same columns to refit from, say of the trials before the last. Its
+        number of components K is begun there alone, and a scan tries only K − 1, K and K + 1.
+    n_jobs : int or None, default=None
+        Threads. None takes one for each core, but a single one in a worker process. The result is
+        the same to the last bit whatever their number.
     random_state : int, numpy.random.Generator or None
         Source of the starts.
 
@@ -106,6 +112,8 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         weights_init: ArrayLike | None = None,
         means_init: ArrayLike | None = None,
         precisions_init: ArrayLike | None = None,
+        start: "GaussianMixture | None" = None,
+        n_jobs: int | None = None,
         random_state: int | np.random.Generator | None = None,
     ) -> None:
         self.n_components = n_components
@@ -117,6 +125,8 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         self.weights_init = weights_init
         self.means_init = means_init
         self.precisions_init = precisions_init
+        self.start = start
+        self.n_jobs = n_jobs
         self.random_state = random_state
 
     @classmethod
@@ -179,35 +189,61 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         weight = _checked_weight(sample_weight, samples)
         size = effective_size(weight)
         used = weight > 0
-        samples, weight = starts.sort_samples(samples[used], weight[used])
-        offset = np.average(samples, axis=0, weights=weight)
-        scale = np.sqrt(np.average((samples - offset) ** 2, axis=0, weights=weight))
-        _refuse_constant(samples, scale)
-        Z = (samples - offset) / scale
-        shift = float(np.log(scale).sum())
+        if not np.all(used):
+            samples, weight = samples[used], weight[used]
+        # The order of the samples matters to k-means++ alone.
+        if self.means_init is None:
+            samples, weight = starts.sort_samples(samples, weight)
+        Z, offset, scale = _standardise(samples, weight)
+        blocks = em.in_blocks(Z, weight)
+        candidates = self._candidates(Z, weight, blocks, offset, scale)
+        fits = fitting.fit_each(blocks, candidates, self._rule(), self._threads())
+        self._keep_best(fits, float(weight.sum()), size, offset, scale)
+        return self
 
-        best: tuple[float, Any] | None = None
-        rng = np.random.default_rng(self.random_state)
-        self.bics_ = {}
-        for K in self._range(len(samples), samples.shape[1]):
-            fitted = self._fit_one(Z, weight, K, offset, scale, rng)
-            mean_log_likelihood = float(fitted[0] / weight.sum()) - shift
-            bic = bic_of(mean_log_likelihood, size, K, samples.shape[1])
-            self.bics_[K] = bic
-            if best is None or bic < best[0]:
-                best = (bic, fitted)
-                self.lower_bound_ = mean_log_likelihood
-        if best is None:
-            raise RuntimeError("the scan over K was empty")
-        _, (_, self.n_iter_, self.converged_, weights, means, covariances) = best
-        if not self.converged_:
-            warnings.warn(
-                f"expectation–maximisation did not converge in max_iter={self.max_iter} "
-                f"iterations; raise max_iter or tol",
-                ConvergenceWarning,
-                stacklevel=2,
-            )
-        self._set_parameters(weights, means * scale + offset, covariances * np.outer(scale, scale))
+    def fit_chunks(self, chunks: Iterable[ArrayLike], n_subsample: int = SUBSAMPLE) -> Self:
+        """Fit the mixture to samples that need not fit in memory.
+
+        The starts are those of a fit to a random subsample; from there all chunks are read once
+        for each iteration, for all K of a scan together. From given starts it takes the steps that
+        `fit` would.
+
+        Parameters
+        ----------
+        chunks : iterable of array-like, shape (n, d)
+            Read several times, so a list or an object such as `misstep.mixture.RowChunks`, which
+            reads an HDF5 dataset or a memory map.
+        n_subsample : int, default=65536
+            Samples in memory from which the starts come.
+
+        Raises
+        ------
+        MisstepError
+            As for `fit`, or if the chunks are not finite matrices of one width, cannot be read
+            twice or change between passes.
+        """
+        if n_subsample < 2:
+            raise MisstepError(f"n_subsample must be at least 2, got {n_subsample}")
+        found = survey(chunks, n_subsample, np.random.default_rng(self.random_state))
+        self.n_features_in_ = len(found.mean)
+        self._check_settings()
+        _refuse_constant(found.subsample[0], np.abs(found.subsample).max(axis=0), found.scale)
+        offset, scale = found.mean, found.scale
+        samples, weight = starts.sort_samples(found.subsample, np.ones(len(found.subsample)))
+        Z = (samples - offset) / scale
+        blocks = em.in_blocks(Z, weight)
+        candidates = self._candidates(Z, weight, blocks, offset, scale)
+        threads, rule = self._threads(), self._rule()
+        if self.means_init is None:
+            begun = fitting.fit_each(blocks, candidates, rule, threads)
+            mixtures = {K: fit.mixture for K, fit in begun.items()}
+        else:
+            mixtures = {K: only() for K, (only,) in candidates.items()}
+        n = found.n_samples
+        fits = fitting.fit_by_passes(
+            StandardisedChunks(chunks, found), list(mixtures.values()), n, rule, threads
+        )
+        self._keep_best(dict(zip(mixtures, fits, strict=True)), n, n, offset, scale)
         return self
 
     def score_samples(self, X: ArrayLike) -> Array:
@@ -304,7 +340,7 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         return ellipses
 
     def _check_settings(self) -> None:
-        bounds = {"n_components": 1, "max_components": 1, "n_init": 1, "max_iter": 0}
+        bounds = {"n_components": 1, "max_components": 1, "n_init": 1, "max_iter": 0, "n_jobs": 1}
         for name, least in bounds.items():
             value = getattr(self, name)
             if value is not None and (not isinstance(value, int | np.integer) or value < least):
@@ -318,6 +354,14 @@ class GaussianMixture(DensityMixin, BaseEstimator):
             raise MisstepError(
                 "a start needs weights_init, means_init, precisions_init and n_components together"
             )
+        if self.start is not None:
+            check_is_fitted(self.start)
+            if self.start.means_.shape[1] != self.n_features_in_ or any(given):
+                raise MisstepError(
+                    f"start has {self.start.means_.shape[1]} columns and the samples "
+                    f"{self.n_features_in_}: refit a mixture of the same columns, without "
+                    f"weights_init, means_init and precisions_init"
+                )
 
     def _range(self, n_samples: int, d: int) -> range:
         if self.n_components is not None:
@@ -327,34 +371,69 @@ class GaussianMixture(DensityMixin, BaseEstimator):
                     f"samples: K can be at most their number"
                 )
             return range(self.n_components, self.n_components + 1)
-        return range(1, max(1, min(self.max_components, n_samples // (d + 1))) + 1)
+        most = max(1, min(self.max_components, n_samples // (d + 1)))
+        if self.start is None:
+            return range(1, most + 1)
+        K = min(self.start.n_components_, most)
+        return range(max(1, K - 1), min(K + 1, most) + 1)
 
-    def _fit_one(
-        self, Z: Array, weight: Array, K: int, offset: Array, scale: Array, rng: np.random.Generator
-    ) -> tuple[float, int, bool, Array, Array, Array]:
-        """Fit K components to standardised samples; return log-likelihood, n_iter, …, mixture."""
-        x = np.ascontiguousarray(Z.T)
-        floor, tol = float(self.covariance_floor), float(self.tol)
+    def _rule(self) -> Rule:
+        return Rule(float(self.covariance_floor), float(self.tol), int(self.max_iter))
+
+    def _threads(self) -> int:
+        return fitting.available_threads() if self.n_jobs is None else self.n_jobs
+
+    def _candidates(
+        self, Z: Array, weight: Array, samples: Samples, offset: Array, scale: Array
+    ) -> dict[int, list[fitting.Start]]:
+        """Return for each K the starts to choose from, given sorted standardised samples (N, d)."""
+        K_range = self._range(*Z.shape)
         if self.means_init is not None:
-            start = self._given_start(K, offset, scale)
-        else:
-            # Every start draws the same numbers whatever happens to the others.
-            tryouts = []
-            for child in rng.spawn(self.n_init if K > 1 else 1):
-                labels = starts.kmeans_plus_plus(Z, weight, K, child)
-                start = starts.moments_of(Z, weight, labels, K, floor)
-                value, _, _ = compiled.fit_em(x, weight, *start, floor, tol, TRYOUT)
-                tryouts.append((-value if math.isfinite(value) else math.inf, start))
-            start = min(tryouts, key=lambda tryout: tryout[0])[1]
-        value, n_iter, converged = compiled.fit_em(x, weight, *start, floor, tol, self.max_iter)
-        if not math.isfinite(value):
-            raise MisstepError(
-                f"a covariance of the {K}-component fit collapsed: the samples lie on a line or a "
-                f"point; a covariance_floor > {floor:g} prevents it"
-            )
-        return value, n_iter, converged, *start
+            return {K: [partial(self._given_start, K, offset, scale)] for K in K_range}
+        spread = starts.spread_of(Z, weight, float(self.covariance_floor))
 
-    def _given_start(self, K: int, offset: Array, scale: Array) -> tuple[Array, Array, Array]:
+        def start(draws: Array) -> Mixture:
+            labels = starts.kmeans_plus_plus(samples, len(Z), draws)
+            return starts.moments_of(samples, len(Z), labels, len(draws), spread)
+
+        candidates: dict[int, list[fitting.Start]] = {}
+        rng = np.random.default_rng(self.random_state)
+        for K in K_range:
+            # Every start draws the same numbers whatever happens to the others.
+            children = rng.spawn(self.n_init if K > 1 else 1)
+            candidates[K] = [partial(start, child.random(K)) for child in children]
+            if self.start is not None and self.start.n_components_ == K:
+                candidates[K] = [partial(_standardised, self.start, offset, scale)]
+        return candidates
+
+    def _keep_best(
+        self, fits: dict[int, fitting.Fit], total: float, size: float, offset: Array, scale: Array
+    ) -> None:
+        """Keep the fit of least BIC as the estimator's own, in the data's units."""
+        shift = float(np.log(scale).sum())
+        self.bics_ = {}
+        bounds = {}
+        for K in sorted(fits):
+            if not math.isfinite(fits[K].log_likelihood):
+                raise MisstepError(
+                    f"a covariance of the {K}-component fit collapsed: the samples lie on a line "
+                    f"or a point; a covariance_floor > {self.covariance_floor:g} prevents it"
+                )
+            bounds[K] = fits[K].log_likelihood / total - shift
+            self.bics_[K] = bic_of(bounds[K], size, K, len(scale))
+        K = min(self.bics_, key=self.bics_.__getitem__)
+        _, self.n_iter_, self.converged_, (weights, means, covariances) = fits[K]
+        self.lower_bound_ = bounds[K]
+        if not self.converged_:
+            warnings.warn(
+                f"expectation–maximisation did not converge in max_iter={self.max_iter} "
+                f"iterations; raise max_iter or tol",
+                ConvergenceWarning,
+                stacklevel=3,
+            )
+        self._set_parameters(weights, means * scale + offset, covariances * np.outer(scale, scale))
+
+    def _given_start(self, K: int, offset: Array, scale: Array) -> Mixture:
         weights = np.array(self.weights_init, dtype=np.float64)
         means = (np.array(self.means_init, dtype=np.float64) - offset) / scale
         precisions = np.array(self.precisions_init, dtype=np.float64, order="C")
@@ -372,7 +451,7 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         if not are_definite(precisions):
             raise MisstepError("precisions_init must be symmetric positive definite")
         covariances = np.linalg.inv(precisions) / np.outer(scale, scale)
-        return weights / weights.sum(), means, covariances
+        return Mixture(weights / weights.sum(), means, covariances)
 
     def _set_parameters(self, weights: Array, means: Array, covariances: Array) -> None:
         if not are_definite(covariances):
@@ -389,13 +468,12 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         samples = validate_data(self, X, dtype=np.float64, reset=False)
         # Whitening is exact only near the origin, and the data may lie far from it.
         origin = self.means_[0]
-        joint: Array = compiled.log_joint(
-            np.ascontiguousarray((samples - origin).T),
-            self._constants,
-            self.means_ - origin,
-            self._whiteners,
-        )
-        return joint
+        blocks, _ = em.in_blocks(samples - origin, np.zeros(len(samples)))
+        work = em.Work.room_for(*self.means_.shape)
+        work.whiteners[:], work.constants[:] = self._whiteners, self._constants
+        joint = np.empty((len(blocks) * em.BLOCK, len(self.means_)))
+        em.log_joint(blocks, self.means_ - origin, work, joint)
+        return joint[: len(samples)]
 
 
 def effective_size(sample_weight: Array) -> float:
@@ -417,6 +495,15 @@ def checked_columns(indices: Sequence[int], d: int) -> list[int]:
     return columns
 
 
+def _standardised(model: GaussianMixture, offset: Array, scale: Array) -> Mixture:
+    """Return the parameters of a fitted mixture in units of standardised samples."""
+    return Mixture(
+        model.weights_.copy(),
+        (model.means_ - offset) / scale,
+        model.covariances_ / np.outer(scale, scale),
+    )
+
+
 def _checked_weight(sample_weight: ArrayLike | None, X: Array) -> Array:
     if sample_weight is None:
         return np.ones(len(X))
@@ -432,11 +519,26 @@ def _checked_weight(sample_weight: ArrayLike | None, X: Array) -> Array:
     return weight
 
 
-def _refuse_constant(X: Array, scale: Array) -> None:
+def _standardise(X: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """Return samples (N, d) of mean 0 and variance 1, and the mean and deviation they had (d,)."""
+    # With the samples innermost, sums over them are several times as fast.
+    columns = np.ascontiguousarray(X.T)
+    total = weight.sum()
+    first, extent = X[0], np.maximum(columns.max(axis=1), -columns.min(axis=1))
+    offset = (columns * weight).sum(axis=1) / total
+    columns -= offset[:, None]
+    scale = np.sqrt((columns**2 * weight).sum(axis=1) / total)
+    _refuse_constant(first, extent, scale)
+    columns /= scale[:, None]
+    return columns.T, offset, scale
+
+
+def _refuse_constant(first: Array, extent: Array, scale: Array) -> None:
+    """Raise MisstepError if a column, of which `first` is a value, hardly varies."""
     # Rounding leaves a constant column a spread of some units in the last place.
-    constant = np.flatnonzero(scale <= 1e-13 * np.abs(X).max(axis=0))
+    constant = np.flatnonzero(scale <= 1e-13 * extent)
     if len(constant):
         column = int(constant[0])
         raise MisstepError(
-            f"column {column} of X is constant ({X[0, column]:g}): a mixture needs varying columns"
+            f"column {column} of X is constant ({first[column]:g}): a mixture needs varying columns"
         )

@@ -6,68 +6,130 @@ changes nothing: two properties that an ordinary k-means++ lacks and that "weigh
 needs.
 """
 
+# mypy: disallow-untyped-defs=False, check-untyped-defs=False
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
+from misstep.mixture.em import BLOCK, COMPILED, Mixture, Samples
+
 Array = NDArray[np.float64]
-Labels = NDArray[np.intp]
+Labels = NDArray[np.int32]
 
 
 def sort_samples(X: Array, sample_weight: Array) -> tuple[Array, Array]:
     """Return the distinct samples (N', d), lexicographically sorted, and their summed weights."""
-    order = np.lexsort(X.T[::-1])
+    order = np.argsort(X[:, 0], kind="stable")
+    leading = X[order, 0]
+    if np.any(leading[1:] == leading[:-1]):
+        order = np.lexsort(X.T[::-1])
     X, sample_weight = X[order], sample_weight[order]
     first = np.flatnonzero(np.append(True, np.any(X[1:] != X[:-1], axis=1)))
+    if len(first) == len(X):
+        return X, sample_weight
     return X[first], np.add.reduceat(sample_weight, first)
 
 
-def kmeans_plus_plus(X: Array, sample_weight: Array, K: int, rng: np.random.Generator) -> Labels:
+def spread_of(X: Array, sample_weight: Array, floor: float) -> Array:
+    """Return the covariance (d, d) of all samples, with the floor."""
+    d = X.shape[1]
+    covariance: Array = np.cov(X.T, aweights=sample_weight, ddof=0).reshape(d, d)
+    return covariance + floor * np.eye(d)
+
+
+def kmeans_plus_plus(samples: Samples, n_samples: int, draws: Array) -> Labels:
     """Assign sorted samples to K seeds, drawn in proportion to squared distance from the others.
 
     Parameters
     ----------
-    X : ndarray, shape (N, d)
-        Standardised samples, sorted by `sort_samples`.
-    sample_weight : ndarray, shape (N,)
-    K : int
-    rng : numpy.random.Generator
+    samples : Samples
+        `n_samples` standardised samples, sorted by `sort_samples`.
+    n_samples : int
+    draws : ndarray, shape (K,)
+        Uniform on [0, 1): one for each seed.
 
     Returns
     -------
-    labels : ndarray of int, shape (N,)
+    labels : ndarray of int32, shape (blocks, BLOCK)
         Index of the nearest seed. Seeds that coincide leave later ones without samples.
     """
-    nearest = np.full(len(X), np.inf)
-    labels = np.zeros(len(X), dtype=np.intp)
-    for k, u in enumerate(rng.random(K)):
-        chance = sample_weight * nearest if k else sample_weight
-        cumulative = np.cumsum(chance)
-        seed = X[min(np.searchsorted(cumulative, u * cumulative[-1], side="right"), len(X) - 1)]
-        distance = ((X - seed) ** 2).sum(axis=1)
-        labels[distance < nearest] = k
-        nearest = np.minimum(nearest, distance)
+    nearest = np.full_like(samples.weight, np.inf)
+    labels = np.zeros(samples.weight.shape, np.int32)
+    _assign(samples, n_samples, draws, nearest, labels, np.empty((2, BLOCK)))
     return labels
 
 
-def moments_of(
-    X: Array, sample_weight: Array, labels: Labels, K: int, floor: float
-) -> tuple[Array, Array, Array]:
-    """Weights (K,), means (K, d) and covariances (K, d, d) of a hard assignment.
+@njit(**COMPILED)
+def _assign(samples, n_samples, draws, nearest, labels, room):
+    blocks, weight = samples.blocks, samples.weight
+    n_blocks, d, _ = blocks.shape
+    distance, gap = room[0], room[1]
+    for k in range(draws.shape[0]):
+        total = 0.0
+        for i in range(n_samples):
+            block, b = divmod(i, BLOCK)
+            total += weight[block, b] * nearest[block, b] if k else weight[block, b]
+        aim = draws[k] * total
+        seed = n_samples - 1
+        total = 0.0
+        for i in range(n_samples):
+            block, b = divmod(i, BLOCK)
+            total += weight[block, b] * nearest[block, b] if k else weight[block, b]
+            if total > aim:
+                seed = i
+                break
+        at, column = divmod(seed, BLOCK)
+        for block in range(n_blocks):
+            for b in range(BLOCK):
+                distance[b] = 0.0
+            for j in range(d):
+                x, s = blocks[block, j], blocks[at, j, column]
+                for b in range(BLOCK):
+                    gap[b] = x[b] - s
+                    distance[b] += gap[b] * gap[b]
+            for b in range(BLOCK):
+                if distance[b] < nearest[block, b]:
+                    labels[block, b] = k
+                    nearest[block, b] = distance[b]
 
-    A covariance is blended with that of all the data, as if d + 1 samples had been drawn from
-    there, so that a seed with few samples still starts with a definite one.
+
+def moments_of(samples: Samples, n_samples: int, labels: Labels, K: int, spread: Array) -> Mixture:
+    """Weights, means and covariances of a hard assignment of standardised samples.
+
+    A covariance is blended with that of all the data, `spread` (d, d), as if d + 1 samples had been
+    drawn from there, so that a seed with few samples still starts with a definite one.
     """
-    d = X.shape[1]
-    mean = np.average(X, axis=0, weights=sample_weight)
-    spread = np.cov(X.T, aweights=sample_weight, ddof=0).reshape(d, d) + floor * np.eye(d)
-    scale = sample_weight.sum() / len(X)
-    weights, means, covariances = np.empty(K), np.empty((K, d)), np.empty((K, d, d))
-    for k in range(K):
-        w = sample_weight * (labels == k)
-        mass = w.sum()
-        means[k] = w @ X / mass if mass > 0 else mean
-        deviations = X - means[k]
-        prior = (d + 1) * scale
-        covariances[k] = ((w * deviations.T) @ deviations + prior * spread / K) / (mass + prior)
-        weights[k] = mass + scale
-    return weights / weights.sum(), means, covariances
+    d = len(spread)
+    mass, first, second = np.zeros(K), np.zeros((K, d)), np.zeros((K, d, d))
+    _add_masses(samples, labels, mass, first)
+    scale = mass.sum() / n_samples
+    means = first / np.maximum(mass, 1e-300)[:, None]
+    _add_squares(samples, labels, means, np.empty(d), second)
+    second += np.tril(second, -1).transpose(0, 2, 1)
+    prior = (d + 1) * scale
+    covariances = (second + prior * spread / K) / (mass + prior)[:, None, None]
+    weights = mass + scale
+    return Mixture(weights / weights.sum(), means, covariances)
+
+
+@njit(**COMPILED)
+def _add_masses(samples, labels, mass, first):
+    n_blocks, d, _ = samples.blocks.shape
+    for block in range(n_blocks):
+        for b in range(BLOCK):
+            k, w = labels[block, b], samples.weight[block, b]
+            mass[k] += w
+            for j in range(d):
+                first[k, j] += w * samples.blocks[block, j, b]
+
+
+@njit(**COMPILED)
+def _add_squares(samples, labels, means, deviation, second):
+    n_blocks, d, _ = samples.blocks.shape
+    for block in range(n_blocks):
+        for b in range(BLOCK):
+            k, w = labels[block, b], samples.weight[block, b]
+            for j in range(d):
+                deviation[j] = samples.blocks[block, j, b] - means[k, j]
+                for m in range(j + 1):
+                    second[k, j, m] += w * deviation[j] * deviation[m]

@@ -1,0 +1,92 @@
+"""Which action now? A donut mixture's mode at one state after another, and at many at once."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from misstep.errors import MisstepError
+from misstep.mixture import compiled
+from misstep.mixture.checks import checked_points
+from misstep.mixture.conditional import Conditioner
+from misstep.mixture.donut import DEFAULT_K, DEFAULT_REACH, check_family
+from misstep.mixture.donut_mixture import FORMULAS, component_arrays
+
+Array = NDArray[np.float64]
+
+
+class DonutQuery:
+    """A joint mixture made ready to be asked for the donut mixture's mode, in one compiled call.
+
+    Parameters
+    ----------
+    conditioner : Conditioner
+        Of n state columns and d actions.
+    scale : array-like, shape (d,)
+        s of the exploration, in the action's unit; see `exploration_from_variance`.
+    k, reach : float
+        The donut family, see `DonutShape.of`.
+    formula : {"prose", "printed"}
+        See `exploration_from_variance`.
+
+    Raises
+    ------
+    MisstepError
+        If a value is out of its range.
+    """
+
+    def __init__(
+        self,
+        conditioner: Conditioner,
+        scale: ArrayLike,
+        k: float = DEFAULT_K,
+        reach: float = DEFAULT_REACH,
+        formula: str = "prose",
+    ) -> None:
+        check_family(k, reach)
+        c = conditioner
+        K, d = c.action_means.shape
+        s = np.array(scale, dtype=np.float64)
+        if s.shape != (d,) or not np.all((s > 0) & (s < np.inf)):
+            raise MisstepError(f"the scale must be {d} positive numbers, got {s.tolist()}")
+        if formula not in FORMULAS:
+            raise MisstepError(f"the formula is 'prose' or 'printed', got {formula!r}")
+        self._family = (formula == "printed", float(k), float(reach), s)
+        self._arrays = (
+            c.state_constants,
+            c.state_means,
+            c.state_whiteners,
+            c.gains,
+            c.action_means,
+            c.covariances,
+            *component_arrays(c.covariances),
+            compiled.scratch_for(K, d),
+        )
+
+    def explore(self, state: Array, action: Array, warm: bool, flat_stays: bool = False) -> float:
+        """Overwrite `action` with a mode at `state` and return ε; nothing is checked or allocated.
+
+        Parameters
+        ----------
+        state : ndarray of float64, shape (n,)
+        action : ndarray of float64, shape (d,)
+        warm : bool
+            Climb from the `action` that comes in; otherwise from the best analytic candidate.
+        flat_stays : bool
+            Whether an action stays where its density is zero in double precision.
+        """
+        exploration: float = compiled.answer(
+            state, action, warm, flat_stays, *self._family, *self._arrays
+        )
+        return exploration
+
+    def modes(self, states: ArrayLike) -> tuple[Array, Array]:
+        """Return the modes (N, d) and ε (N,) at states (N, n), each from its best candidate.
+
+        Raises
+        ------
+        MisstepError
+            If `states` has another shape or is not finite.
+        """
+        x = checked_points(states, self._arrays[1].shape[1])
+        actions = np.zeros((len(x), len(self._family[-1])))
+        epsilons = [self.explore(*pair, warm=False) for pair in zip(x, actions, strict=True)]
+        return actions, np.array(epsilons)
