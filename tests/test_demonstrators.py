@@ -1,10 +1,12 @@
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from misstep.demonstrators import demonstrate, list_demonstrators
+from misstep.demonstrators import DEMONSTRATORS, demonstrate, list_demonstrators
 from misstep.errors import MisstepError
+from misstep.parameters import parameter
 from misstep.systems import CartPole, make_system
 from misstep.trajectory import Column, Outcome
 
@@ -109,6 +111,34 @@ def test_bang_bang_reacts_late_to_what_it_saw(system):
 def test_recorded_parameters_of_the_demonstrator(system):
     trajectory = demonstrate(system, "weak", n=1, gain=5)[0]
     assert trajectory.provenance.demonstrator == "weak(gain=5)"
+
+
+def test_parameters_of_any_type_are_recorded(system, monkeypatch):
+    @dataclass(frozen=True)
+    class Still:
+        """Does nothing, in a manner of its own; as a third party may write it."""
+
+        needs = "nothing"
+        manner: str = parameter("calm", "", "how it stands by")
+        count: int = parameter(1, "", "of nothing")
+
+        @classmethod
+        def fits(cls, system):
+            return True
+
+        def policy(self, system, rng, attempt):
+            return Standing()
+
+    class Standing:
+        def reset(self):
+            pass
+
+        def __call__(self, observation):
+            return np.zeros(1)
+
+    monkeypatch.setitem(DEMONSTRATORS._own, "still", Still)
+    trajectory = demonstrate(system, "still", n=1, manner="tense", count=3)[0]
+    assert trajectory.provenance.demonstrator == "still(manner=tense, count=3)"
 
 
 def test_recorded_seed_is_the_systems(system):

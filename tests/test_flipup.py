@@ -1,44 +1,17 @@
 import math
 
-import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
+from strikes import strike
 
 from misstep.errors import MisstepError
-from misstep.systems import FlipUp, FlipUpParameters, list_systems, make_system
-
-
-def strike(system, speed, start=0.25, rise=0.35, seed=0):
-    """Strike with a smoothly rising velocity; return the observations, the cost and the info."""
-    observation, info = system.reset(seed=seed)
-    observations, over = [observation], False
-    while not over:
-        assert not info["failed"]
-        assert not info["success"]
-        u = np.clip(observation[0] / (rise * system.stroke), 0.0, 1.0)
-        velocity = speed * (start + (1.0 - start) * u * u * (3.0 - 2.0 * u))
-        observation, reward, over, truncated, info = system.step(np.array([velocity]))
-        assert not truncated
-        observations.append(observation)
-    return np.array(observations), -reward, info
+from misstep.systems import FlipUp, FlipUpParameters
 
 
 @pytest.fixture(scope="module")
 def system():
     return FlipUp()
-
-
-# Gymnasium prefers normalised actions and bounded observations; here both are physical quantities.
-@pytest.mark.filterwarnings("ignore:.*we recommend using a symmetric and normalized space")
-@pytest.mark.filterwarnings("ignore:.*A Box observation space (min|max)imum value is -?infinity")
-@pytest.mark.parametrize("render_mode", [None, "rgb_array"])
-def test_passes_gymnasium_checks(render_mode):
-    env = gymnasium.make("misstep/FlipUp-v1", render_mode=render_mode, block_mass=0.25)
-    check_env(env.unwrapped, skip_render_check=render_mode is None)
-    assert env.unwrapped.parameters["block_mass"] == 0.25
-    env.close()
 
 
 @pytest.mark.parametrize(("start", "rise"), [(0.25, 0.35), (0.45, 0.2), (0.15, 0.6), (0.45, 0.6)])
@@ -135,29 +108,6 @@ def test_a_verdict_that_takes_too_long_is_a_failure():
     assert info == {"failed": True, "success": False}
 
 
-def test_actions_are_clipped_to_the_speed_limit(system):
-    np.testing.assert_array_equal(
-        strike(system, 1e3, start=1.0)[0], strike(system, 1.5, start=1.0)[0]
-    )
-
-
-def test_same_seed_same_strike_other_seed_another():
-    def episode(seed):
-        return strike(FlipUp(start_spread=0.002), 1.0, seed=seed)[0]
-
-    np.testing.assert_array_equal(episode(7), episode(7))
-    assert not np.array_equal(episode(7), episode(8))
-    np.testing.assert_array_equal(
-        strike(FlipUp(), 1.0, seed=7)[0], strike(FlipUp(), 1.0, seed=8)[0]
-    )
-
-
-def test_an_episode_leaves_nothing_behind(system):
-    first = strike(system, 1.04)[0]
-    strike(system, 1.5)
-    np.testing.assert_array_equal(strike(system, 1.04)[0], first)
-
-
 def test_starts_are_distributed_as_said():
     system = FlipUp(start_spread=0.001)
     system.reset(seed=0)
@@ -186,23 +136,6 @@ def test_model_has_the_dimensions_and_masses_asked_for():
     assert total == pytest.approx(0.5 * 9.81, rel=1e-3)
 
 
-def test_parameters_rebuild_the_system():
-    first = FlipUp(block_mass=0.3, start_spread=0.001, v_max=2)
-    again = make_system("flipup", **first.parameters)
-    assert again.parameters == first.parameters
-    np.testing.assert_array_equal(strike(first, 1.0)[0], strike(again, 1.0)[0])
-
-
-def test_lists_every_parameter_with_unit_and_documents_it():
-    rows = list_systems()["flipup"]
-    assert {row.name: row.default for row in rows} == FlipUp().parameters
-    for row in rows:
-        line = next(line for line in FlipUp.__doc__.splitlines() if f"``{row.name}``  " in line)
-        assert line.split()[1] == str(row.default)
-        assert row.unit in line
-        assert row.meaning
-
-
 @pytest.mark.parametrize(
     ("parameters", "line"),
     [
@@ -219,19 +152,6 @@ def test_lists_every_parameter_with_unit_and_documents_it():
 def test_wrong_parameters_are_told_in_one_line(refused, parameters, line):
     with refused(line):
         FlipUp(**parameters)
-
-
-@pytest.mark.parametrize(
-    ("action", "line"),
-    [
-        (np.array([math.nan]), "nan m/s, which is not a finite velocity"),
-        (np.zeros(2), r"has shape \(2,\) but one velocity in m/s, shape \(1,\)"),
-    ],
-)
-def test_wrong_actions_are_told(refused, system, action, line):
-    system.reset(seed=0)
-    with refused(line):
-        system.step(action)
 
 
 def test_defaults_are_the_parameters_of_the_dataclass():

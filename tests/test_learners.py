@@ -148,13 +148,58 @@ def test_the_donut_policy_is_the_composition_of_its_parts(
         donuts = DonutMixture(conditional, exploration, settings.k, settings.reach)
         start = None if climb == "global" else previous
         flat = climb == "density" and start is not None and donuts.pdf([start])[0] == 0.0
-        expected = start if flat else np.clip(donuts.mode(start), -5.0, 5.0)
+        expected = start if flat else donuts.mode(start)
+        if start is None and np.any(np.abs(expected) > 5.0):
+            expected = donuts.mode(best_start_within(5.0, conditional, donuts))
+        expected = np.clip(expected, -5.0, 5.0)
         action = policy(observation)
         np.testing.assert_allclose(action, expected, atol=1e-5)
         assert policy.exploration == pytest.approx(exploration, rel=1e-9)
         shown = policy.donut_at(observation)
         assert shown.exploration == pytest.approx(exploration, rel=1e-12)
         previous = action
+
+
+def best_start_within(limit, conditional, donuts):
+    """Return the densest centre or ridge point that lies within ±limit; if none does, clipped."""
+    candidates = []
+    for mean, covariance in zip(conditional.means, conditional.covariances, strict=True):
+        candidates.append(mean)
+        for arm in donuts.ridge_radius * np.linalg.cholesky(covariance).T:
+            candidates += [mean + arm, mean - arm]
+    possible = [c for c in candidates if np.all(np.abs(c) <= limit)]
+    possible = possible or [np.clip(c, -limit, limit) for c in candidates]
+    return max(possible, key=lambda c: donuts.log_pdf([c])[0])
+
+
+def test_the_first_action_is_a_mode_that_the_actuators_can_do():
+    # A ridge at 7.1 and one at 0.9, equally high: the first is out of reach.
+    mixture = GaussianMixture.from_parameters([1.0], [[0.0, 4.0]], [np.diag([1.0, 1.2])])
+    attempt = trajectory(np.random.default_rng(0), 2, 1, 1)
+    policy = DonutPolicy(
+        task_of(attempt, limit=5.0), mixture, np.ones(1), DonutSettings(2.0, 3.0, "warm", "prose")
+    )
+    action = policy(np.zeros(1))
+    donuts = policy.donut_at([0.0])
+    free = donuts.mode()
+    assert abs(free[0]) > 5.0
+    grid = np.linspace(-5.0, 5.0, 4001)[:, None]
+    density = donuts.pdf(grid)
+    inner = np.flatnonzero((density[1:-1] > density[:-2]) & (density[1:-1] > density[2:])) + 1
+    assert np.min(np.abs(grid[inner] - action)) < 0.003
+    assert abs(action[0]) < 4.99
+
+
+def test_reach_varies_over_the_trials():
+    rng = np.random.default_rng(0)
+    attempts = [trajectory(rng) for _ in range(2)]
+    learner = DonutLearner(reach=2.5, variation=0.2)
+    reaches = []
+    for n_trials in range(6):
+        evidence = Evidence.seen_from(1, Dataset(attempts), attempts[:1] * n_trials)
+        policy = learner.policy(task_of(attempts[0]), evidence, np.random.default_rng(0))
+        reaches.append(policy.settings.reach)
+    np.testing.assert_allclose(reaches, [2.5, 2.0, 3.0] * 2)
 
 
 def test_only_the_climb_up_the_density_stays_where_it_is_flat():
@@ -334,6 +379,10 @@ def test_a_constant_column_is_named(refused, name):
         ("donut", {"k": 1.0}, "k is 1 but must be greater than 1"),
         ("donut", {"k": float("inf")}, "k is inf but must be a finite number"),
         ("donut", {"reach": 0.5}, "reach is 0.5 but must be at least 1"),
+        ("donut", {"variation": 0.6}, r"variation is 0.6, but reach · \(1 − variation\) must be"),
+        ("donut", {"spacing": "even"}, "spacing is 'even'; there are: time, path"),
+        ("mean", {"spacing": "even"}, "spacing is 'even'; there are: time, path"),
+        ("mean", {"resolution": 0.0}, "resolution is 0 but must be greater than 0"),
         ("donut", {"scale": -1.0}, "scale is -1 action's unit but must be at least 0"),
         ("mean", {"n_components": -1}, "n_components is -1 but must be at least 0"),
         ("mean", {"n_components": 1.5}, "n_components is 1.5 but must be a whole number"),

@@ -13,6 +13,7 @@ from misstep.learners.search import total_cost
 from misstep.trajectory import Column, Outcome, Provenance, Trajectory
 
 STATE = ("theta", "theta_dot")
+BETWEEN = ["balanced-mean", "widest-gap", "random-scaling"]
 SEARCHES = ["random-linear", "hill-climbing", "cma-es", "power"]
 
 
@@ -145,14 +146,53 @@ def test_widest_gap_halves_it_and_goes_on_to_the_next():
     shown = [stroke(s) for s in (1.0, 1.2, 2.4, 2.6)]
     first = strength_of("widest-gap", shown)
     assert first == pytest.approx(1.8, abs=0.05)
+    # Of success 0.8 is expected in the gap, most of it in the middle, and 0.2 anywhere.
+    grid = np.linspace(1.2, 1.8, 60_001)
+    u = (grid - 1.2) / 1.2
+    mass = np.cumsum(0.8 * 6 * u * (1 - u) / 1.2 + 0.2 / 1.6)
+    halving = grid[np.searchsorted(mass, mass[-1] / 2)]
+    assert 1.55 < halving < 1.6
     second = strength_of("widest-gap", shown, [stroke(first)])
-    assert second == pytest.approx(1.5, abs=0.05) or second == pytest.approx(2.1, abs=0.05)
+    mirrored = 3.6 - halving
+    assert min(abs(second - halving), abs(second - mirrored)) < 0.05
+    third = strength_of("widest-gap", shown, [stroke(first), stroke(second)])
+    assert abs(third - first) == pytest.approx(1.8 - halving, abs=0.05)
+    assert (third - first) * (second - first) < 0
 
 
-def test_widest_gap_does_not_count_a_success_as_a_failure():
+def test_widest_gap_makes_do_with_one_demonstration_and_with_equal_ones():
+    assert strength_of("widest-gap", [stroke(1.0)]) == pytest.approx(1.0, abs=0.05)
+    same = stroke(1.0)
+    assert strength_of("widest-gap", [same, same]) == pytest.approx(1.0, abs=0.05)
+    assert 1.0 < strength_of("widest-gap", [stroke(1.0)], [stroke(2.0)]) < 2.0
+
+
+def test_widest_gap_repeats_what_has_succeeded():
     shown = [stroke(s) for s in (1.0, 2.0)]
-    success = stroke(1.5, outcome=Outcome.SUCCESS)
-    assert strength_of("widest-gap", shown, [success]) == pytest.approx(1.5, abs=0.05)
+    success = stroke(1.7, outcome=Outcome.SUCCESS)
+    assert strength_of("widest-gap", shown, [success]) == pytest.approx(1.7, abs=0.05)
+    assert strength_of("widest-gap", [success]) == pytest.approx(1.7, abs=0.05)
+
+
+@pytest.mark.parametrize("learner", BETWEEN)
+def test_an_attempt_may_push_against_a_limit_or_stop_at_once(learner):
+    # A strike that is told to stop at its first step, and one at full speed all along.
+    stopped = stroke(1.0)
+    stopped = replace(
+        stopped, observations=stopped.observations[:2], actions=stopped.actions[:1] * 0.0
+    )
+    full = replace(stroke(1.0), actions=np.full((40, 1), 10.0))
+    strength = strength_of(learner, [stroke(2.0), stopped, full])
+    assert 0.0 <= strength <= 10.0
+    if learner == "widest-gap":  # between 2 (1 + p) and 10 at p = 0.1, 0.5, 0.9
+        middle = np.mean([0.5 * (2.0 + 10.0 / (1 + p)) for p in (0.1, 0.5, 0.9)])
+        assert strength == pytest.approx(middle, abs=0.1)
+
+
+@pytest.mark.parametrize("learner", BETWEEN)
+def test_messages_name_a_learner_as_it_is_registered(refused, learner):
+    with refused(f"learner {learner}: max_components is 0 but must be at least 1"):
+        LEARNERS[learner](max_components=0)
 
 
 def test_balanced_mean_gives_every_demonstrator_one_say():
@@ -174,7 +214,7 @@ def test_random_scaling_scales_the_mean_after_the_first_trial():
     assert np.std(np.log(factors)) == pytest.approx(np.log(1.5) / np.sqrt(3), rel=0.3)
 
 
-@pytest.mark.parametrize("learner", ["balanced-mean", "widest-gap", "random-scaling"])
+@pytest.mark.parametrize("learner", BETWEEN)
 def test_a_blend_survives_a_file(learner):
     shown = [stroke(s) for s in (1.0, 1.5, 2.5)]
     kind = LEARNERS[learner]

@@ -82,7 +82,7 @@ class Reversed(_Proportional):
 class Random:
     """Acts at random, over everything that the actuators can do, on any system."""
 
-    hold: float = parameter(0.1, "s", "for how long one draw of the force is held", above=0)
+    hold: float = parameter(0.1, "s", "for how long one draw of the action is held", above=0)
 
     def __post_init__(self) -> None:
         check_parameters(self, "demonstrator random")
@@ -96,7 +96,7 @@ class Random:
         return bool(np.isfinite(space.low).all() and np.isfinite(space.high).all())
 
     def policy(self, system: System, rng: np.random.Generator, attempt: int) -> Policy:
-        """Return the policy force ~ uniform over the action space, held."""
+        """Return the policy action ~ uniform over the action space, held."""
         return _RandomPolicy(self, system, rng)
 
 

@@ -144,8 +144,12 @@ def _signature(by: str, demonstrator: Demonstrator) -> str:
     """Return the kind's name, followed by the parameters that are not at their defaults."""
     values = asdict(demonstrator)  # type: ignore[call-overload]
     changed = [
-        f"{row.name}={values[row.name]:g}"
+        f"{row.name}={_printed(values[row.name])}"
         for row in parameter_table(type(demonstrator))
         if values[row.name] != row.default
     ]
     return f"{by}({', '.join(changed)})" if changed else by
+
+
+def _printed(value: ParameterValue) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -27,6 +27,8 @@ from misstep.trajectory import Outcome, Trajectory
 
 Array = NDArray[np.float64]
 
+_ANYWHERE = 0.2  # probability that success is not in the widest gap between the demonstrations
+
 
 class BlendPolicy:
     """A weighted mean of what several mixtures do on average at a state.
@@ -73,18 +75,29 @@ class BlendPolicy:
 
 @dataclass(frozen=True)
 class _Blend(MixtureParameters):
+    """A mixture for each attempt, and what is common to the learners that blend them."""
+
     max_components: int = parameter(3, "", "largest number that BIC may choose", at_least=1)
 
     rung: ClassVar[int] = 1
+    learner: ClassVar[str]
 
     def __post_init__(self) -> None:
-        check_parameters(self, f"learner {type(self).__name__}")
+        check_parameters(self, f"learner {self.learner}")
 
     def mixtures(
         self, task: Task, attempts: Sequence[Trajectory], rng: np.random.Generator
     ) -> list[GaussianMixture]:
         """Return a mixture of each attempt."""
-        return [self.fit(joint_samples(task, [attempt]), rng) for attempt in attempts]
+        spread = joint_samples(task, attempts).std(axis=0)
+        return [self._mixture(task.joint(attempt), spread, rng) for attempt in attempts]
+
+    def _mixture(self, samples: Array, spread: Array, rng: np.random.Generator) -> GaussianMixture:
+        """Fit one attempt; a single Gaussian if it is too short or stays at one limit all along."""
+        if len(samples) > len(spread) and np.all(np.ptp(samples, axis=0) > 0):
+            return self.fit(samples, rng)
+        covariance = np.cov(samples.T, bias=True) + np.diag((self.resolution * spread) ** 2)
+        return GaussianMixture.from_parameters([1.0], [samples.mean(axis=0)], [covariance])
 
     @staticmethod
     def restore(task: Task, arrays: Mapping[str, Array]) -> BlendPolicy:
@@ -99,6 +112,8 @@ class BalancedMean(_Blend):
 
     The first trial weighs all demonstrators equally, later ones by a Bayesian bootstrap.
     """
+
+    learner: ClassVar[str] = "balanced-mean"
 
     def policy(self, task: Task, evidence: Evidence, rng: np.random.Generator) -> BlendPolicy:
         """Return the balanced mean."""
@@ -116,26 +131,39 @@ class WidestGap(_Blend):
     """Rung 1: the middle of the widest gap between neighbouring failures that nobody tried yet.
 
     Attempts are ordered by their mean action over all states that were met; trials that failed
-    close gaps.
+    close gaps. How wide a gap is, and where its middle, is told by `success_probability`. Where
+    something has succeeded, that is repeated instead.
     """
 
+    learner: ClassVar[str] = "widest-gap"
+
     def policy(self, task: Task, evidence: Evidence, rng: np.random.Generator) -> BlendPolicy:
-        """Return the mean of the two failures around the widest gap."""
-        failed = [t for t in evidence.attempts if t.outcome is not Outcome.SUCCESS]
-        mixtures = self.mixtures(task, failed, rng)
-        if len(mixtures) == 1:
-            return BlendPolicy(task, mixtures, np.ones(1))
-        strengths = _strengths(task, failed, mixtures)
+        """Return the blend of the two failures around the widest gap."""
+        attempts = evidence.attempts
+        succeeded = [t for t in attempts if t.outcome is Outcome.SUCCESS]
+        mixtures = self.mixtures(task, succeeded or attempts, rng)
+        if succeeded or len(mixtures) == 1:
+            return BlendPolicy(task, mixtures, np.full(len(mixtures), 1.0 / len(mixtures)))
+        strengths = _strengths(task, attempts, mixtures)
+        shown = strengths[: len(evidence.demonstrations)]
         order = np.argsort(strengths, kind="stable")
-        gap = int(np.argmax(np.diff(strengths[order])))
-        pair = [mixtures[order[gap]], mixtures[order[gap + 1]]]
-        return BlendPolicy(task, pair, np.array([0.5, 0.5]))
+        places = success_probability(strengths[order], strengths, shown)
+        gap = int(np.argmax(np.diff(places)))
+        below, above = order[gap : gap + 2]
+        shares = np.linspace(0.0, 1.0, 1001)
+        blends = (1.0 - shares) * strengths[below] + shares * strengths[above]
+        middle = 0.5 * (places[gap] + places[gap + 1])
+        share = np.interp(middle, success_probability(blends, strengths, shown), shares)
+        pair = [mixtures[below], mixtures[above]]
+        return BlendPolicy(task, pair, np.array([1.0 - share, share]))
 
 
 @LEARNERS.register("random-scaling")
 @dataclass(frozen=True)
 class RandomScaling(_Blend):
     """Rung 1: the demonstrations' mean times a random factor; learns nothing."""
+
+    learner: ClassVar[str] = "random-scaling"
 
     widest: float = parameter(2.0, "", "largest factor, and the inverse of the smallest", above=1)
 
@@ -145,6 +173,37 @@ class RandomScaling(_Blend):
         factor = np.exp(rng.uniform(-bound, bound)) if evidence.trials else 1.0
         mixtures = self.mixtures(task, evidence.demonstrations, rng)
         return BlendPolicy(task, mixtures, np.full(len(mixtures), factor / len(mixtures)))
+
+
+def success_probability(strengths: Array, tried: Array, shown: Array) -> Array:
+    """Return how probable it is that no more than these strengths succeeds, shape (N,).
+
+    That is judged from the demonstrations alone. Success is expected near the middle of the widest
+    gap between them, with density 6u(1 − u) for u from 0 to 1 across it, because next to a failure
+    there is mostly another one. Should that be wrong, one part in five is spread evenly over
+    everything that was tried.
+
+    Parameters
+    ----------
+    strengths : ndarray, shape (N,)
+    tried : ndarray, shape (at least 2,)
+        The strengths of all attempts.
+    shown : ndarray, shape (at least 1,)
+        Those of the demonstrations.
+    """
+    low, high = tried.min(), tried.max()
+    ordered = np.sort(shown) if len(shown) > 1 else np.array([low, high])
+    gap = int(np.argmax(np.diff(ordered)))
+    middle = _share_of(strengths, ordered[gap], ordered[gap + 1])
+    even = _share_of(strengths, low, high)
+    probability: Array = (1.0 - _ANYWHERE) * middle**2 * (3.0 - 2.0 * middle) + _ANYWHERE * even
+    return probability
+
+
+def _share_of(values: Array, low: float, high: float) -> Array:
+    """Return where values lie from `low`, 0, to `high`, 1; cut off there."""
+    share: Array = np.clip((values - low) / max(high - low, np.finfo(np.float64).tiny), 0.0, 1.0)
+    return share
 
 
 def _strengths(

@@ -7,17 +7,19 @@ Every failure counts the same.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from misstep.errors import MisstepError
-from misstep.learners.learner import LEARNERS, Evidence, Task, joint_samples
+from misstep.learners.learner import LEARNERS, Evidence, Task
 from misstep.learners.mixtures import (
     MixtureParameters,
     MixturePolicy,
+    SpacedMixtureParameters,
+    check_choice,
     restore_mixture,
 )
 from misstep.mixture import DonutMixture, GaussianMixture, compiled, exploration_from_variance
@@ -61,11 +63,8 @@ class DonutParameters(MixtureParameters):
         """Raise MisstepError if a parameter is out of its range."""
         check_parameters(self, owner)
         check_family(self.k, self.reach)
-        for name, valid in (("climb", CLIMBS), ("formula", FORMULAS)):
-            if getattr(self, name) not in valid:
-                raise MisstepError(
-                    f"{owner}: {name} is {getattr(self, name)!r}; there are: {', '.join(valid)}"
-                )
+        check_choice(owner, "climb", self.climb, CLIMBS)
+        check_choice(owner, "formula", self.formula, FORMULAS)
 
     @staticmethod
     def restore(task: Task, arrays: Mapping[str, Array]) -> "DonutPolicy":
@@ -153,10 +152,12 @@ class DonutPolicy(MixturePolicy):
     def __call__(self, observation: Array, /) -> Array:
         """Return the mode, clipped; the next climb starts from there."""
         k, reach, climb, formula = self.settings
+        state = self.state_of(observation)
+        warm = climb != "global" and not self._first
         self.exploration = compiled.explore(
-            self.state_of(observation),
+            state,
             self._action,
-            climb != "global" and not self._first,
+            warm,
             climb == "density",
             formula == "printed",
             k,
@@ -165,8 +166,21 @@ class DonutPolicy(MixturePolicy):
             *self._arrays,
         )
         self._first = False
-        self._action = self.clipped(self._action)
+        possible = self.clipped(self._action)
+        if not warm and not np.array_equal(possible, self._action):
+            # Clipped it would be no mode, and every trial after it the same.
+            possible = self.clipped(self._possible_mode(state))
+        self._action = possible
         return self._action.copy()
+
+    def _possible_mode(self, state: Array) -> Array:
+        """Return the mode above the best analytic candidate that the actuators can do, (m,)."""
+        donuts = self.donut_at(state)
+        candidates = _candidates(donuts)
+        clipped = self.clipped(candidates)
+        inside = np.all(candidates == clipped, axis=1)
+        starts = clipped[inside] if inside.any() else clipped
+        return donuts.mode(starts[np.argmax(donuts.log_pdf(starts))])
 
     def donut_at(self, state: ArrayLike) -> DonutMixture:
         """Return the donut mixture at `state` (n,), for looking at and measuring."""
@@ -184,15 +198,43 @@ class DonutPolicy(MixturePolicy):
 
 @LEARNERS.register("donut")
 @dataclass(frozen=True)
-class DonutLearner(DonutParameters):
+class DonutLearner(DonutParameters, SpacedMixtureParameters):
     """Rung 1: the donut mixture of Grollman & Billard; all failures count the same."""
+
+    variation: float = parameter(
+        0.0,
+        "",
+        "v: over the trials reach is multiplied by 1, 1 − v, 1 + v in turn",
+        at_least=0,
+        at_most=1,
+    )
 
     rung: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
         self.check("learner donut")
+        self.check_spacing("learner donut")
+        if self.reach * (1.0 - self.variation) < 1.0:
+            raise MisstepError(
+                f"learner donut: variation is {self.variation:g}, but reach · (1 − variation) must "
+                f"be at least 1, and reach is {self.reach:g}"
+            )
 
     def policy(self, task: Task, evidence: Evidence, rng: np.random.Generator) -> DonutPolicy:
         """Return the donut policy on all attempts."""
-        mixture = self.fit(joint_samples(task, evidence.attempts), rng)
-        return self.act_on(task, mixture, evidence.demonstrations)
+        mixture = self.fit_attempts(task, evidence.attempts, rng)
+        turn = (0.0, -1.0, 1.0)[len(evidence.trials) % 3]
+        reach = self.reach * (1.0 + turn * self.variation)
+        return replace(self, reach=reach, variation=0.0).act_on(
+            task, mixture, evidence.demonstrations
+        )
+
+
+def _candidates(donuts: DonutMixture) -> Array:
+    """Return the centres m_k and the points m_k ± m*_k on their ridges, shape (K (2m + 1), m)."""
+    means, covariances = donuts.conditional.means, donuts.conditional.covariances
+    arms = donuts.ridge_radius * np.linalg.cholesky(covariances)
+    # The columns of a Cholesky factor are points of the unit ellipsoid.
+    ridges = np.stack([means[:, :, None] + arms, means[:, :, None] - arms], axis=1)
+    on_ridges = ridges.transpose(0, 1, 3, 2).reshape(-1, means.shape[1])
+    return np.concatenate([means, on_ridges])

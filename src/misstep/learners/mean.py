@@ -7,12 +7,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from misstep.learners.learner import LEARNERS, Evidence, Task, joint_samples
-from misstep.learners.mixtures import (
-    MixtureParameters,
-    MixturePolicy,
-    restore_mixture,
-)
+from misstep.learners.learner import LEARNERS, Evidence, Task
+from misstep.learners.mixtures import MixturePolicy, SpacedMixtureParameters, restore_mixture
 from misstep.parameters import check_parameters
 
 Array = NDArray[np.float64]
@@ -28,17 +24,18 @@ class MeanPolicy(MixturePolicy):
 
 @LEARNERS.register("mean")
 @dataclass(frozen=True)
-class Mean(MixtureParameters):
+class Mean(SpacedMixtureParameters):
     """Rung 0: Gaussian mixture regression on everything that was tried; explores nothing."""
 
     rung: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
         check_parameters(self, "learner mean")
+        self.check_spacing("learner mean")
 
     def policy(self, task: Task, evidence: Evidence, rng: np.random.Generator) -> MeanPolicy:
         """Return the average of all attempts as a policy."""
-        return MeanPolicy(task, self.fit(joint_samples(task, evidence.attempts), rng))
+        return MeanPolicy(task, self.fit_attempts(task, evidence.attempts, rng))
 
     @staticmethod
     def restore(task: Task, arrays: Mapping[str, Array]) -> MeanPolicy:

@@ -1,21 +1,19 @@
 """What the mixture learners share: fitting the (state, action) pairs, and keeping the result."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
-from misstep.learners.learner import Task
+from misstep.learners.learner import Task, joint_samples
+from misstep.learners.spacing import SPACINGS, path_weights
 from misstep.mixture import Conditioner, GaussianMixture
 from misstep.parameters import parameter
+from misstep.trajectory import Trajectory
 
 Array = NDArray[np.float64]
-
-# Half a percent of a column's spread: finer detail is noise, and forces clipped at the actuator's
-# limit would otherwise grow components without width.
-COVARIANCE_FLOOR = 2.5e-5
 
 _PARTS = ("weights", "means", "covariances")
 
@@ -28,6 +26,10 @@ class MixtureParameters:
         0, "", "components of the mixture; 0: chosen by minimum BIC", at_least=0
     )
     max_components: int = parameter(6, "", "largest number that BIC may choose", at_least=1)
+    # Without width, components would grow on forces that are clipped at the actuator's limit.
+    resolution: float = parameter(
+        0.005, "", "width of the narrowest component, as a share of each column's spread", above=0
+    )
 
     def fit(
         self, samples: Array, rng: np.random.Generator, sample_weight: Array | None = None
@@ -36,10 +38,37 @@ class MixtureParameters:
         return GaussianMixture(
             n_components=self.n_components or None,
             max_components=self.max_components,
-            covariance_floor=COVARIANCE_FLOOR,
+            covariance_floor=self.resolution**2,
             tol=1e-4,
             random_state=rng,
         ).fit(samples, sample_weight=sample_weight)
+
+
+@dataclass(frozen=True)
+class SpacedMixtureParameters(MixtureParameters):
+    """Parameters of the learners that fit one mixture to all attempts, whatever came of them."""
+
+    spacing: str = parameter(
+        "time", "", "what each sample stands for: time, or path: the way travelled in the state"
+    )
+
+    def fit_attempts(
+        self, task: Task, attempts: Sequence[Trajectory], rng: np.random.Generator
+    ) -> GaussianMixture:
+        """Fit the (state, action) pairs of all attempts."""
+        samples = joint_samples(task, attempts)
+        weight = path_weights(task, attempts) if self.spacing == "path" else None
+        return self.fit(samples, rng, weight)
+
+    def check_spacing(self, owner: str) -> None:
+        """Raise MisstepError if there is no such spacing."""
+        check_choice(owner, "spacing", self.spacing, SPACINGS)
+
+
+def check_choice(owner: str, name: str, value: str, choices: Sequence[str]) -> None:
+    """Raise MisstepError unless the parameter `name` of `owner` is one of `choices`."""
+    if value not in choices:
+        raise MisstepError(f"{owner}: {name} is {value!r}; there are: {', '.join(choices)}")
 
 
 class MixturePolicy:

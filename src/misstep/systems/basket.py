@@ -105,12 +105,7 @@ class Basket(StrikingSystem):
 
     **Action**, ``Box(1,)``, float64
 
-    =====  ===============  ======  ========================================================
-    index  column           unit    meaning
-    =====  ===============  ======  ========================================================
-    0      ``velocity``     m/s     that the effector's servo is told, clipped to
-                                    0 .. ``v_max``
-    =====  ===============  ======  ========================================================
+    <action>
 
     **Reward**: minus the horizontal distance between the ball and the basket's centre, in m, after
     the step. That of the last step is the error of the landing.
@@ -134,44 +129,8 @@ class Basket(StrikingSystem):
 
     Parameters
     ----------
-    render_mode : {None, "rgb_array"}
-        With ``"rgb_array"``, `render` returns a picture, shape (360, 640, 3), uint8.
-    **parameters
-        Fields of `BasketParameters`:
-
-        =====================  =======  =========  ==========================================
-        name                   default  unit       meaning
-        =====================  =======  =========  ==========================================
-        ``v_max``              2.0      m/s        largest velocity that can be commanded
-        ``stop_speed``         0.01     m/s        the stroke is over when less is commanded
-        ``longest_stroke``     1.5      s          the stroke is over after this time
-        ``longest_wait``       3.0      s          from the stroke to the verdict, at most
-        ``control_rate``       200.0    Hz         actions per second
-        ``physics_step``       0.001    s          longest step of the simulation; the control
-                                                   period is cut into equal ones
-        ``gravity``            9.81     m/s²       downward acceleration
-        ``effector_mass``      2.0      kg         mass of the effector, which gravity spares
-        ``effector_radius``    0.012    m          radius of the effector, a sphere
-        ``effector_friction``  0.2      1          friction coefficient of the effector
-        ``servo_gain``         400.0    N·s/m      force per error of the velocity
-        ``force_limit``        400.0    N          largest force of the servo
-        ``effector_offset``    0.12     m          from the pivot to the effector's line
-        ``pivot_height``       0.25     m          height of the lever's pivot
-        ``ball_arm``           0.3      m          from the pivot to the cup
-        ``bend_deg``           20.0     deg        how far the arm of the cup is bent up
-        ``swing_deg``          25.0     deg        the lever swings this far to either side
-        ``hinge_damping``      0.002    N·m·s/rad  viscous friction in the pivot
-        ``struck_arm_mass``    0.05     kg         mass of the arm that is struck
-        ``ball_arm_mass``      0.08     kg         mass of the arm of the cup
-        ``ball_radius``        0.02     m          radius of the ball
-        ``ball_mass``          0.05     kg         mass of the ball
-        ``ball_friction``      0.6      1          friction coefficient of the ball
-        ``basket_distance``    0.8      m          from the pivot to the basket's centre
-        ``basket_half_width``  0.1      m          from the basket's centre to a wall
-        ``basket_height``      0.08     m          height of the basket's walls
-        ``inside_time``        0.3      s          success is to stay inside this long
-        ``start_spread``       0.0      m          spread of the ball's place in the cup
-        =====================  =======  =========  ==========================================
+    <render_mode>
+    <parameters>
 
     Raises
     ------
@@ -214,7 +173,7 @@ class Basket(StrikingSystem):
         self._ball_radius = p.ball_radius
         self._basket = (p.basket_distance, p.basket_half_width, p.basket_height)
         self._inside_periods = max(1, round(p.inside_time * p.control_rate))
-        self._settling_periods = round(_SETTLING * p.control_rate)
+        self._settling_periods = max(1, round(_SETTLING * p.control_rate))
         self._start_spread = p.start_spread
 
     def _start(self) -> None:
@@ -263,6 +222,11 @@ class Basket(StrikingSystem):
         return False
 
 
+def struck_arm_length(p: BasketParameters) -> float:
+    """Return the length of the arm that the effector strikes, m."""
+    return p.effector_offset / _ARM_END
+
+
 def start_height(p: BasketParameters) -> float:
     """Return the height of the effector's centre above the pivot at the start, m."""
     slope = math.radians(p.swing_deg)
@@ -288,7 +252,7 @@ def basket_spec(p: BasketParameters) -> Any:
 
     struck, holding = spec.geom("struck_arm"), spec.geom("ball_arm")
     struck.mass, holding.mass = p.struck_arm_mass, p.ball_arm_mass
-    struck.fromto = (0.0, 0.0, 0.0, p.effector_offset / _ARM_END, 0.0, 0.0)
+    struck.fromto = (0.0, 0.0, 0.0, struck_arm_length(p), 0.0, 0.0)
     end = (-p.ball_arm * math.cos(bend), 0.0, p.ball_arm * math.sin(bend))
     holding.fromto = (0.0, 0.0, 0.0, *end)
     cup = spec.body("cup")

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from misstep.parameters import ParameterValue, build_parameters
-from misstep.systems.basket import BasketParameters, basket_spec, start_height
+from misstep.systems.basket import BasketParameters, basket_spec, start_height, struck_arm_length
 from misstep.systems.drawing import (
     BLUE,
     DARK,
@@ -26,10 +26,11 @@ from misstep.systems.drawing import (
     STEEL,
     Canvas,
     Point,
+    Sketch,
     light,
     rgba,
 )
-from misstep.systems.offscreen import Offscreen
+from misstep.systems.offscreen import Offscreen, Scene
 from misstep.systems.striking_drawing import StrikingView, add_arrow, add_rod
 
 ARROW_LENGTH, ARROW_THICKNESS, ARROW_OFFSET = 0.18, 0.008, 0.06  # m
@@ -76,7 +77,7 @@ class _BasketView(StrikingView):
         return self.arrow((x + ARROW_OFFSET, z + 0.6 * ARROW_LENGTH), velocity)
 
 
-class BasketScene(_BasketView):
+class BasketScene(_BasketView, Scene):
     """Basket in three dimensions.
 
     Parameters
@@ -153,12 +154,8 @@ class BasketScene(_BasketView):
         add_arrow(screen, ends, 0.0, ARROW_THICKNESS)
         return screen.picture()
 
-    def close(self) -> None:
-        """Give back what OpenGL holds."""
-        self._screen.close()
 
-
-class BasketSketch(_BasketView):
+class BasketSketch(_BasketView, Sketch):
     """Basket as a flat drawing; takes the place of `BasketScene` without OpenGL."""
 
     def draw(
@@ -187,9 +184,6 @@ class BasketSketch(_BasketView):
             canvas.arrow(start, end, 2 * ARROW_THICKNESS, ORANGE)
         return canvas.picture()
 
-    def close(self) -> None:
-        """Nothing is held."""
-
     def _draw_lever(self, canvas: Canvas, angle: float) -> None:
         p, bend = self.p, math.radians(self.p.bend_deg)
 
@@ -199,7 +193,7 @@ class BasketSketch(_BasketView):
             return x * c + z * s, p.pivot_height - x * s + z * c
 
         cup = (-p.ball_arm * math.cos(bend), p.ball_arm * math.sin(bend))
-        canvas.line(place(0, 0), place(p.effector_offset / 0.85, 0), 0.012, DARK)
+        canvas.line(place(0, 0), place(struck_arm_length(p), 0), 0.012, DARK)
         canvas.line(place(0, 0), place(*cup), 0.012, DARK)
         along, up = (math.cos(bend), -math.sin(bend)), (math.sin(bend), math.cos(bend))
 

@@ -27,10 +27,11 @@ from misstep.systems.drawing import (
     STEEL,
     STOP,
     Canvas,
+    Sketch,
     light,
     rgba,
 )
-from misstep.systems.offscreen import Offscreen
+from misstep.systems.offscreen import Offscreen, Scene
 
 RAIL, CART, WHEEL, HINGE, POLE, FALLEN, FORCE = STEEL, DARK, GREY, LIGHT, BLUE, RED, ORANGE
 
@@ -98,7 +99,7 @@ class _CartPoleView:
                 yield place, long
 
 
-class CartPoleScene(_CartPoleView):
+class CartPoleScene(_CartPoleView, Scene):
     """A cart-pole in three dimensions.
 
     Parameters
@@ -208,12 +209,8 @@ class CartPoleScene(_CartPoleView):
             )
         return screen.picture()
 
-    def close(self) -> None:
-        """Give back what OpenGL holds."""
-        self._screen.close()
 
-
-class CartPoleSketch(_CartPoleView):
+class CartPoleSketch(_CartPoleView, Sketch):
     """A cart-pole as a flat drawing; takes the place of `CartPoleScene` without OpenGL."""
 
     def draw(
@@ -243,9 +240,6 @@ class CartPoleSketch(_CartPoleView):
         if start != end:
             canvas.arrow((x + start, 0.0), (x + end, 0.0), 2 * ARROW_THICKNESS * u, FORCE)
         return canvas.picture()
-
-    def close(self) -> None:
-        """Nothing is held."""
 
     def _draw_cart(self, canvas: Canvas, x: float) -> None:
         u = self.unit

@@ -85,6 +85,13 @@ class Canvas:
         return np.asarray(self._image.reduce(self._FINER))
 
 
+class Sketch:
+    """A flat drawing, on a `Canvas` of its own for each picture."""
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
 def light(spec: Any) -> None:
     """Light a `mujoco.MjSpec` from the camera and from above, before a seamless backdrop."""
     spec.visual.global_.fovy = 30.0

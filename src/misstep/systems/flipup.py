@@ -100,12 +100,7 @@ class FlipUp(StrikingSystem):
 
     **Action**, ``Box(1,)``, float64
 
-    =====  ===============  ======  ========================================================
-    index  column           unit    meaning
-    =====  ===============  ======  ========================================================
-    0      ``velocity``     m/s     that the effector's servo is told, clipped to
-                                    0 .. ``v_max``
-    =====  ===============  ======  ========================================================
+    <action>
 
     **Reward**: minus the angle between the block and upright, in degrees, after the step. That of
     the last step is the verdict's: 0 to ``upright_angle_deg`` for a success, near 90 for a failure.
@@ -129,40 +124,8 @@ class FlipUp(StrikingSystem):
 
     Parameters
     ----------
-    render_mode : {None, "rgb_array"}
-        With ``"rgb_array"``, `render` returns a picture, shape (360, 640, 3), uint8.
-    **parameters
-        Fields of `FlipUpParameters`:
-
-        =====================  =======  =========  ==========================================
-        name                   default  unit       meaning
-        =====================  =======  =========  ==========================================
-        ``v_max``              1.5      m/s        largest velocity that can be commanded
-        ``stop_speed``         0.01     m/s        the stroke is over when less is commanded
-        ``longest_stroke``     1.5      s          the stroke is over after this time
-        ``longest_wait``       3.0      s          from the stroke to the verdict, at most
-        ``control_rate``       200.0    Hz         actions per second
-        ``physics_step``       0.001    s          longest step of the simulation; the control
-                                                   period is cut into equal ones
-        ``gravity``            9.81     m/s²       downward acceleration
-        ``effector_mass``      2.0      kg         mass of the effector, which gravity spares
-        ``effector_radius``    0.01     m          radius of the effector, a sphere
-        ``effector_friction``  0.2      1          friction coefficient of the effector
-        ``servo_gain``         400.0    N·s/m      force per error of the velocity
-        ``force_limit``        400.0    N          largest force of the servo
-        ``stroke``             0.05     m          how far the effector goes up
-        ``retract_speed``      0.3      m/s        how fast it goes back
-        ``effector_offset``    0.03     m          from the table's edge to the effector
-        ``block_length``       0.12     m          length of the block as it lies
-        ``block_height``       0.06     m          height of the block as it lies
-        ``block_depth``        0.06     m          depth of the block
-        ``block_mass``         0.2      kg         mass of the block, uniform
-        ``overhang``           0.042    m          how far the block reaches over the edge
-        ``table_friction``     0.9      1          friction coefficient of block and table
-        ``upright_angle_deg``  3.0      deg        it stands within this angle of upright
-        ``upright_time``       1.0      s          success is to stand this long
-        ``start_spread``       0.0      m          standard deviation of the block's place
-        =====================  =======  =========  ==========================================
+    <render_mode>
+    <parameters>
 
     Raises
     ------
@@ -254,6 +217,11 @@ class FlipUp(StrikingSystem):
         return turning + math.hypot(self._rate("block_x"), self._rate("block_z"))
 
 
+def start_height(p: FlipUpParameters) -> float:
+    """Return the height of the effector's centre above the table's top at the start, m."""
+    return -p.effector_radius - _GAP
+
+
 def flipup_spec(p: FlipUpParameters) -> Any:
     """Return the model with the parameters set, an uncompiled `mujoco.MjSpec`."""
     spec = striking_spec("flipup.xml", p)
@@ -262,5 +230,5 @@ def flipup_spec(p: FlipUpParameters) -> Any:
     block.mass = p.block_mass
     for name in ("block", "table"):
         spec.geom(name).friction[0] = p.table_friction
-    spec.body("effector").pos = (p.effector_offset, 0.0, -p.effector_radius - _GAP)
+    spec.body("effector").pos = (p.effector_offset, 0.0, start_height(p))
     return spec

@@ -12,9 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from misstep.parameters import ParameterValue, build_parameters
-from misstep.systems.drawing import BLUE, GREY, LIGHT, ORANGE, STEEL, Canvas, Point, light, rgba
-from misstep.systems.flipup import FlipUpParameters, flipup_spec
-from misstep.systems.offscreen import Offscreen
+from misstep.systems.drawing import (
+    BLUE,
+    GREY,
+    LIGHT,
+    ORANGE,
+    STEEL,
+    Canvas,
+    Point,
+    Sketch,
+    light,
+    rgba,
+)
+from misstep.systems.flipup import FlipUpParameters, flipup_spec, start_height
+from misstep.systems.offscreen import Offscreen, Scene
 from misstep.systems.striking_drawing import StrikingView, add_arrow, add_rod
 
 # In units of the block's length.
@@ -36,7 +47,7 @@ class _FlipUpView(StrikingView):
 
     def tip(self, position: float) -> Point:
         """Return the centre of the effector's tip, m."""
-        return self.p.effector_offset, position - self.p.effector_radius - 0.001
+        return self.p.effector_offset, start_height(self.p) + position
 
     def velocity_arrow(self, position: float, velocity: float) -> tuple[Point, Point]:
         """Return start and end of the arrow beside the effector, m."""
@@ -44,7 +55,7 @@ class _FlipUpView(StrikingView):
         return self.arrow((x + ARROW_OFFSET * self.unit, z), velocity)
 
 
-class FlipUpScene(_FlipUpView):
+class FlipUpScene(_FlipUpView, Scene):
     """Flip-up in three dimensions.
 
     Parameters
@@ -108,12 +119,8 @@ class FlipUpScene(_FlipUpView):
         add_arrow(screen, ends, -0.5 * self.p.block_depth, ARROW_THICKNESS * self.unit)
         return screen.picture()
 
-    def close(self) -> None:
-        """Give back what OpenGL holds."""
-        self._screen.close()
 
-
-class FlipUpSketch(_FlipUpView):
+class FlipUpSketch(_FlipUpView, Sketch):
     """Flip-up as a flat drawing; takes the place of `FlipUpScene` without OpenGL."""
 
     def draw(
@@ -136,9 +143,6 @@ class FlipUpSketch(_FlipUpView):
         if start != end:
             canvas.arrow(start, end, 2 * ARROW_THICKNESS * u, ORANGE)
         return canvas.picture()
-
-    def close(self) -> None:
-        """Nothing is held."""
 
     def _slice(self, observation: Mapping[str, float], start: float, end: float) -> list[Point]:
         """Return the corners of the block between two places along it, m."""

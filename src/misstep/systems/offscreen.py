@@ -112,6 +112,16 @@ class Offscreen:
         self._free()
 
 
+class Scene:
+    """A drawing in three dimensions; what it is of, it says itself."""
+
+    _screen: Offscreen
+
+    def close(self) -> None:
+        """Give back what OpenGL holds."""
+        self._screen.close()
+
+
 def _open(model: Any, width: int, height: int) -> tuple[Any, Any]:
     if _failures:
         raise NoOpenGLError(_failures[0])

@@ -7,6 +7,7 @@ to the stroke, where the action acted; a learner that conditions the velocity on
 never sees a command that was ignored.
 """
 
+import inspect
 import math
 from abc import abstractmethod
 from dataclasses import asdict, dataclass
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
-from misstep.parameters import check_parameters, parameter
+from misstep.parameters import check_parameters, parameter, parameter_table
 from misstep.systems.system import System
 from misstep.trajectory import Column
 
@@ -44,7 +45,11 @@ class StrikingParameters:
     )
     control_rate: float = parameter(200.0, "Hz", "actions per second", above=0)
     physics_step: float = parameter(
-        0.001, "s", "longest step of the simulation", above=0, at_most=0.002
+        0.001,
+        "s",
+        "longest step of the simulation; a control period is cut into equal ones",
+        above=0,
+        at_most=0.002,
     )
     gravity: float = parameter(9.81, "m/s²", "downward acceleration", above=0)
     effector_mass: float = parameter(
@@ -77,7 +82,8 @@ class StrikingSystem(System):
     """A system in which an effector strikes once along its stroke.
 
     A task says where an episode starts, what is observed, how far from success it is, and when
-    the verdict is clear.
+    the verdict is clear. In its docstring the line ``<action>`` stands for the table of the action,
+    ``<render_mode>`` and ``<parameters>`` for the documentation of the constructor's arguments.
 
     Parameters
     ----------
@@ -96,6 +102,12 @@ class StrikingSystem(System):
     action_columns = (Column("velocity", "m/s"),)
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 200}  # noqa: RUF012
     stroke: float
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        # Under `python -OO` there are no docstrings.
+        if cls.__doc__ and hasattr(cls, "parameters_type"):
+            cls.__doc__ = _documented(inspect.cleandoc(cls.__doc__), cls.parameters_type)
 
     def __init__(self, p: StrikingParameters, spec: Any, render_mode: str | None) -> None:
         if render_mode not in (None, "rgb_array"):
@@ -248,6 +260,44 @@ class StrikingSystem(System):
         if self._painter is not None:
             self._painter.close()
             self._painter = None
+
+
+_ACTION = """\
+=====  ===============  ======  ========================================================
+index  column           unit    meaning
+=====  ===============  ======  ========================================================
+0      ``velocity``     m/s     that the effector's servo is told, clipped to
+                                0 .. ``v_max``
+=====  ===============  ======  ========================================================"""
+
+_RENDER_MODE = """\
+render_mode : {None, "rgb_array"}
+    With ``"rgb_array"``, `render` returns a picture, shape (360, 640, 3), uint8."""
+
+
+def _documented(doc: str, kind: type) -> str:
+    """Return a task's docstring with what is said of every task, and its table of parameters."""
+    parameters = f"**parameters\n    Fields of `{kind.__name__}`:\n\n" + _parameter_rows(kind)
+    for line, text in (
+        ("<action>", _ACTION),
+        ("<render_mode>", _RENDER_MODE),
+        ("<parameters>", parameters),
+    ):
+        doc = doc.replace(line, text)
+    return doc
+
+
+def _parameter_rows(kind: type) -> str:
+    """Return the table of parameters, indented as the description of an argument."""
+    rows = [("name", "default", "unit", "meaning")]
+    rows += [(f"``{r.name}``", str(r.default), r.unit, r.meaning) for r in parameter_table(kind)]
+    widths = [max(len(row[i]) for row in rows) for i in range(4)]
+    rule = "  ".join("=" * width for width in widths)
+    lines = [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+    return "\n".join(f"    {line}" for line in (rule, lines[0], rule, *lines[1:], rule))
 
 
 def striking_spec(file: str, p: StrikingParameters) -> Any:
