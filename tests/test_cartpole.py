@@ -142,6 +142,59 @@ def test_friction_only_takes_energy(friction):
     assert energies[0] - energies[-1] > 0.01
 
 
+HEAVY = {
+    "cart_mass": 10.0,
+    "pole_mass": 5.0,
+    "half_length": 1.0,
+    "pole_inertia": 1.0,
+    "force_limit": 256.0,
+    "rail": 15.0,
+}
+
+
+def test_a_pole_of_another_inertia_is_a_dumbbell():
+    # Two points of half the mass, sqrt(I / m) to either side of the centre, have its inertia.
+    system = CartPole(**{**LONG, **FRICTIONLESS, **HEAVY})
+    p = system.parameters
+    along = p["half_length"] + math.sqrt(p["pole_inertia"] / p["pole_mass"]) * np.array([-1, 1])
+
+    def dumbbell_energy(state):
+        _, x_dot, theta, theta_dot = state
+        v_x = x_dot + along * math.cos(theta) * theta_dot
+        v_z = -along * math.sin(theta) * theta_dot
+        points = 0.5 * (v_x**2 + v_z**2) + p["gravity"] * along * math.cos(theta)
+        return 0.5 * p["cart_mass"] * x_dot**2 + 0.5 * p["pole_mass"] * points.sum()
+
+    system.set_state(0.0, 0.0, 0.4, 0.0)
+    forces = np.random.default_rng(3).uniform(-100, 100, 100)
+    states = drive(system, forces)
+    work = np.cumsum(forces * np.diff(states[:, 0]))
+    gained = [dumbbell_energy(state) - dumbbell_energy(states[0]) for state in states]
+    assert np.abs(work).max() > 10.0
+    assert np.ptp(np.unwrap(states[:, 2])) > math.pi / 2
+    np.testing.assert_allclose(gained[1:], work, atol=1e-3)
+
+
+def test_without_an_inertia_the_pole_is_a_uniform_rod():
+    forces = np.random.default_rng(4).uniform(-20, 20, 100)
+    states = []
+    for inertia in (0.0, 0.1 * 0.5**2 / 3.0):
+        system = CartPole(**LONG, pole_inertia=inertia)
+        system.set_state(0.0, 0.0, 0.4, 0.0)
+        states.append(drive(system, forces))
+    np.testing.assert_array_equal(*states)
+
+
+def test_swing_up_takes_a_heavy_pole_on_a_long_rail():
+    system = make_system("cartpole-swingup", **HEAVY, track_limit=15.0)
+    system.reset(seed=0)
+    for _ in range(40):
+        observation, _, terminated, _, info = system.step(np.array([256.0]))
+        assert info["force"] == 256.0
+        assert not terminated
+    assert 2.4 < observation[0] < 15.0
+
+
 def test_rail_stops_hold_and_do_not_throw_back():
     system = CartPole(**LONG, rail=1.0, pole_mass=0.001, physics_step=0.005)
     system.set_state(0.0, 0.0, math.pi, 0.0)

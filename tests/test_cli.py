@@ -263,7 +263,7 @@ NOWHERE = ("--out", "D.h5/sub/x.h5")  # below a file: even the administrator can
     ("words", "told"),
     [
         ((), ["command", "--help"]),
-        (("dance",), ["'dance'", "demonstrate, learn, resume, evaluate, reproduce, study, list"]),
+        (("dance",), ["'dance'", "demonstrate, learn, resume, evaluate, inspect, mark, convert"]),
         (("learn", "--speed", "3"), ["--speed", "--learner, --state, --max-trials"]),
         (("learn",), ["SYSTEM", "misstep learn --help"]),
         (("learn", "cartpole", "--from"), ["--from", "argument"]),
@@ -288,7 +288,7 @@ NOWHERE = ("--out", "D.h5/sub/x.h5")  # below a file: even the administrator can
         (("demonstrate", "cartpole", "--by", "magic", "--out", "N.h5"), ["'magic'", "weak"]),
         (("demonstrate", "cartpole", "-n", "0", "--out", "N.h5"), ["n is 0", "at least 1"]),
         (("demonstrate", "cartpole", "--seed", "-1", "--out", "N.h5"), ["seed is -1"]),
-        (("demonstrate", "cartpole", "--out", "N.csv"), ["'.csv'", ".h5"]),
+        (("demonstrate", "cartpole", "--out", "N.txt"), ["'.txt'", ".h5"]),
         (("demonstrate", "cartpole", *NOWHERE), ["D.h5/sub"]),
         (("demonstrate", "cartpole", "--out", "gone/N.h5"), ["folder gone"]),
         (("demonstrate", "cartpole", "--out", "N.h5", "--json", "gone/r"), ["--json", "gone"]),

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -13,13 +14,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from peak_memory import needs_status, run_with_peak
 
+from misstep import formats
 from misstep.errors import MisstepError
-from misstep.formats import FORMATS, append_trajectory, hdf5, load_dataset, save_dataset
+from misstep.formats import FORMATS, append_trajectory, format, load_dataset, save_dataset
+from misstep.formats.format import Block, Ending, Episode, Header
+from misstep.formats.hdf5_arrays import RowReader
 from misstep.trajectory import Column, Dataset, Outcome, Provenance, Trajectory
 
 COLUMNS = (Column("x", "m"), Column("theta", "rad"))
 FORCE = (Column("force", "N"),)
+PACKING = {"compression": "gzip", "shuffle": True}
 
 
 def make(n_steps=4, seed=0, **changes):
@@ -116,6 +122,80 @@ def test_many_episodes_come_back_in_their_order(tmp_path):
     assert load_dataset(tmp_path / "many.h5") == dataset
 
 
+def blocks_of(trajectory, sizes):
+    """Cut a trajectory into blocks whose observations, actions and costs end at other rows."""
+    arrays = [trajectory.observations, trajectory.actions, trajectory.costs]
+    at = [0, 0, 0]
+    while any(start < len(array) for start, array in zip(at, arrays, strict=True)):
+        parts = []
+        for i, array in enumerate(arrays):
+            size = next(sizes)
+            parts.append(array[at[i] : at[i] + size])
+            at[i] += size
+        yield Block(*parts)
+
+
+def as_episode(trajectory, rng, most=9000):
+    header = Header(trajectory.dt, COLUMNS, FORCE, trajectory.provenance)
+    sizes = iter(lambda: int(rng.integers(0, most)), None)
+    ending = Ending(trajectory.outcome, trajectory.failure_step, ("a note",))
+    return Episode(header, blocks_of(trajectory, sizes), lambda: ending)
+
+
+@pytest.mark.parametrize("steps", [3, 999, 32_767, 32_768, 65_536, 65_537, 200_000])
+def test_blocks_of_any_size_make_the_same_episode(tmp_path, steps):
+    rng = np.random.default_rng(steps)
+    trajectory = make(steps, outcome="failure", failure_step=steps)
+    streamed, whole = tmp_path / "streamed.h5", tmp_path / "whole.h5"
+    formats.write_episodes(streamed, [as_episode(trajectory, rng)])
+    noted = replace(trajectory, provenance=replace(trajectory.provenance, notes=("a note",)))
+    save_dataset(Dataset([noted]), whole)
+    assert load_dataset(streamed) == load_dataset(whole) == Dataset([noted])
+    with h5py.File(streamed) as file:  # as any other program reads it
+        episode = file["episode_0"]
+        np.testing.assert_array_equal(episode["observations"][:], trajectory.observations)
+        np.testing.assert_array_equal(episode["rewards"][:], -trajectory.costs)
+        assert np.flatnonzero(episode["terminations"][:]).tolist() == [steps - 1]
+        rows = min(2**15, steps + 1)
+        assert episode["observations"].chunks == (None if steps < 500 else (rows, 2))
+
+
+def test_numbers_that_cannot_be_deflated_come_back(tmp_path):
+    rng = np.random.default_rng(0)
+    bits = rng.integers(0, 2**63, size=(100_001, 2), dtype=np.uint64).view(float)
+    bits[~np.isfinite(bits)] = 0.0
+    dataset = Dataset([make(100_000, observations=bits), make(9_999, observations=bits[:10_000])])
+    assert load_dataset(saved(tmp_path, dataset)) == dataset
+
+
+def test_a_file_of_the_first_version_reads_the_same(tmp_path):
+    # Before there were chunks of rows, an array of more than 1,000 elements was one chunk.
+    trajectory = make(100_000)
+    path = saved(tmp_path, Dataset([trajectory]))
+    with h5py.File(path, "r+") as file:
+        for name in ARRAYS:
+            values = file["episode_0"][name][()]
+            del file["episode_0"][name]
+            file["episode_0"].create_dataset(
+                name, data=values, chunks=values.shape, compression="gzip", shuffle=True
+            )
+    assert load_dataset(path) == Dataset([trajectory])
+
+
+def test_what_hdf5_cannot_hold_is_refused_before_it_is_written(tmp_path):
+    even, path = as_episode(make(), np.random.default_rng(0)), tmp_path / "a.h5"
+    header = even.header
+    for changed, reason in (
+        (replace(header, dt=None), "uneven times"),
+        (replace(header, action_columns=()), "no actions"),
+    ):
+        with pytest.raises(MisstepError, match=reason):
+            formats.write_episodes(path, [replace(even, header=changed)])
+    with pytest.raises(MisstepError, match="no episode"):
+        formats.write_episodes(path, [])
+    assert os.listdir(tmp_path) == []
+
+
 # The layout, read by h5py as any other program would
 
 
@@ -188,12 +268,14 @@ def refused(path, reason):
 
 def test_unknown_suffix_lists_the_known_ones(tmp_path):
     for call in (
-        lambda: load_dataset(tmp_path / "a.csv"),
-        lambda: save_dataset(Dataset([make()]), tmp_path / "a.csv"),
-        lambda: append_trajectory(tmp_path / "a.csv", make()),
+        lambda: load_dataset(tmp_path / "a.xls"),
+        lambda: save_dataset(Dataset([make()]), tmp_path / "a.xls"),
+        lambda: append_trajectory(tmp_path / "a.xls", make()),
     ):
-        with pytest.raises(MisstepError, match=r"a\.csv: .*'\.csv'; there are: \.h5, \.hdf5"):
+        with pytest.raises(MisstepError, match=r"a\.xls: .*'\.xls'; there are: .*\.h5, \.hdf5"):
             call()
+    with pytest.raises(MisstepError, match=r"no format named 'xls'; there are: .*csv.*hdf5"):
+        load_dataset(tmp_path / "a.h5", "xls")
     assert FORMATS["hdf5"].suffixes == (".h5", ".hdf5")
     assert os.listdir(tmp_path) == []
 
@@ -335,7 +417,7 @@ def test_values_that_are_not_finite_are_named(tmp_path):
         ("/", "total_episodes", 2**63 - 1, "total_episodes is"),
         ("/", "total_steps", 10, "total_steps counts 1 steps more"),
         ("/", "total_steps", 8, "episode_1: total_steps is 5"),
-        ("/", "total_steps", 2**62, "bytes: at most"),
+        ("/", "total_steps", 2**62, "total_steps counts .* steps more"),
         ("episode_1", "total_steps", 4, r"terminations has shape \(5,\): it has to be \(4,\)"),
         ("episode_1", "total_steps", 0, "total_steps is 0"),
         ("episode_1", "outcome", np.bytes_(b"won"), "outcome is 'won'; there are"),
@@ -372,6 +454,7 @@ def test_missing_attributes_are_named(tmp_path, owner):
         refused(path, f"attribute {name} is missing")
 
 
+@needs_status
 def test_a_bomb_is_refused_before_it_takes_memory(tmp_path):
     path = saved(tmp_path, Dataset([make(20_000)]))
     packer = zlib.compressobj(9)
@@ -381,35 +464,35 @@ def test_a_bomb_is_refused_before_it_takes_memory(tmp_path):
         assert len(bomb) < observations.nbytes < 1e6  # so that only inflating it tells
         observations.id.write_direct_chunk((0, 0), bomb)
     code = (
-        "import resource, sys\nfrom misstep.formats import load_dataset\n"
-        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "from misstep.formats import load_dataset\n"
+        "before = peak()\n"
         "try:\n    load_dataset(sys.argv[1])\nexcept ValueError as error:\n    print(error)\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"
+        "print(peak() - before)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True
-    )
-    reason, grown = done.stdout.splitlines()
+    reason, grown = run_with_peak(code, path)
     assert "longer or shorter" in reason
-    assert int(grown) < 50_000  # KiB on Linux; 300 MiB would have been made
+    assert int(grown) < 50_000  # KiB; 300 MiB would have been made
 
 
-def test_too_large_a_dataset_is_not_written(tmp_path, monkeypatch):
-    monkeypatch.setattr(hdf5, "LARGEST_FILE", 20_000)
-    save_dataset(Dataset([make(100)]), tmp_path / "a.h5")
-    for call in (
-        lambda: save_dataset(Dataset([make(600)]), tmp_path / "a.h5"),
-        lambda: append_trajectory(tmp_path / "a.h5", make(600)),
-    ):
-        with pytest.raises(MisstepError, match="at most 20000 are allowed"):
-            call()
-    assert load_dataset(tmp_path / "a.h5") == Dataset([make(100)])
+def test_what_is_too_large_for_memory_is_read_block_by_block(tmp_path, monkeypatch):
+    path = saved(tmp_path, Dataset([make(5000), make(5000, seed=1)]))
+    for bound, where in ((100_000, "episode_0: it takes"), (200_000, "h5: it takes")):
+        monkeypatch.setattr(format, "LARGEST_IN_MEMORY", bound)
+        monkeypatch.setattr(formats, "LARGEST_IN_MEMORY", bound)
+        refused(path, f"{where} up more than {bound} bytes in memory")
+    rows = [sum(len(b.observations) for b in e.blocks) for e in formats.read_episodes(path)]
+    assert rows == [5001, 5001]
 
 
-def test_too_large_a_file_is_not_read(tmp_path, monkeypatch):
-    path = saved(tmp_path)
-    monkeypatch.setattr(hdf5, "LARGEST_FILE", path.stat().st_size - 1)
-    refused(path, "would take up .* bytes")
+def test_a_piece_that_claims_gigabytes_is_refused(tmp_path):
+    shape = (2**28, 2)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("x", shape, "<f8", chunks=(*shape[:1], 1), compression="gzip")
+        file.create_dataset("y", shape, "<f8", chunks=(2**27, 2), compression="gzip", shuffle=True)
+        file.create_dataset("z", (2**27 + 1, 2), "<f8", chunks=(2**27 + 1, 2), **PACKING)
+        for name, reason in (("x", "another way"), ("y", "another way"), ("z", "in one piece")):
+            with pytest.raises(MisstepError, match=reason):
+                RowReader(file, name, file[name].shape, np.dtype("<f8"))
 
 
 def test_a_file_that_is_open_elsewhere_can_be_read_and_replaced(tmp_path):
@@ -433,7 +516,7 @@ def test_append_wants_the_same_kind(tmp_path):
     path = saved(tmp_path)
     before = path.read_bytes()
     for changes, line in (
-        ({"dt": 0.01}, "trajectory 1 has dt 0.01"),
+        ({"dt": 0.01}, "episode_2 has dt 0.01"),
         ({"action_columns": (Column("u", "N"),)}, "has action_columns u"),
     ):
         with pytest.raises(MisstepError, match=line):

@@ -19,7 +19,19 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from misstep.cli import catalogue, evaluate, learn, record, reproduce, study
+from misstep.cli import (
+    bench,
+    catalogue,
+    convert,
+    evaluate,
+    inspect,
+    learn,
+    live,
+    mark,
+    record,
+    reproduce,
+    study,
+)
 from misstep.errors import MisstepError
 from misstep.version import __version__
 
@@ -61,7 +73,19 @@ def misstep(
     """Learn a working controller from demonstrations that all failed."""
 
 
-for _module in (record, learn, evaluate, reproduce, study, catalogue):
+for _module in (
+    record,
+    learn,
+    live,
+    evaluate,
+    inspect,
+    mark,
+    convert,
+    reproduce,
+    study,
+    bench,
+    catalogue,
+):
     for _name, _command, _example in _module.COMMANDS:
         app.command(_name, epilog=_EXAMPLE.format(_example))(_command)
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from misstep.costs import StateCost
 from misstep.errors import MisstepError
 from misstep.parameters import ParameterValue, build_parameters, check_parameters, parameter
+from misstep.systems.mechanics import Mechanics
 from misstep.systems.system import System
 from misstep.trajectory import Column
 
@@ -37,8 +38,14 @@ class CartPoleParameters:
     """
 
     cart_mass: float = parameter(1.0, "kg", "mass of the cart", above=0)
-    pole_mass: float = parameter(0.1, "kg", "mass of the pole, a uniform thin rod", above=0)
+    pole_mass: float = parameter(0.1, "kg", "mass of the pole", above=0)
     half_length: float = parameter(0.5, "m", "from the hinge to the pole's centre of mass", above=0)
+    pole_inertia: float = parameter(
+        0.0,
+        "kg·m²",
+        "inertia of the pole about its centre of mass; 0: that of a uniform thin rod",
+        at_least=0,
+    )
     hinge_damping: float = parameter(
         0.002, "N·m·s/rad", "viscous friction in the hinge", at_least=0
     )
@@ -169,8 +176,10 @@ class CartPole(System):
         name                        default  unit       meaning
         ==========================  =======  =========  =====================================
         ``cart_mass``               1.0      kg         mass of the cart
-        ``pole_mass``               0.1      kg         mass of the pole, a uniform thin rod
+        ``pole_mass``               0.1      kg         mass of the pole
         ``half_length``             0.5      m          from hinge to the pole's centre of mass
+        ``pole_inertia``            0.0      kg·m²      of the pole about its centre of mass; 0:
+                                                        that of a uniform thin rod
         ``hinge_damping``           0.002    N·m·s/rad  viscous friction in the hinge
         ``cart_damping``            0.1      N·s/m      viscous friction on the rail
         ``gravity``                 9.81     m/s²       downward acceleration
@@ -206,15 +215,15 @@ class CartPole(System):
     Notes
     -----
     Equations of motion, with m the mass of the pole, M that of the cart, l ``half_length``, and
-    the inertia m l²/3 of a uniform thin rod about its centre:
+    I ``pole_inertia``, which is m l²/3 for a uniform thin rod:
 
     - (M + m) ẍ + m l (θ̈ cos θ − θ̇² sin θ) = F − ``cart_damping`` ẋ
-    - (4/3) m l² θ̈ + m l ẍ cos θ − m g l sin θ = −``hinge_damping`` θ̇
+    - (I + m l²) θ̈ + m l ẍ cos θ − m g l sin θ = −``hinge_damping`` θ̇
 
     **Version history**
 
-    - v1 (``misstep/CartPole-v1``): first version. ``track_limit``, ``upright_time`` and
-      ``upright_angle_deg`` came later; their defaults change nothing.
+    - v1 (``misstep/CartPole-v1``): first version. ``track_limit``, ``upright_time``,
+      ``upright_angle_deg`` and ``pole_inertia`` came later; their defaults change nothing.
     """
 
     system_id: ClassVar[str] = "cartpole"
@@ -412,6 +421,34 @@ class CartPole(System):
         observation[2] = wrap_angle(float(observation[2]))
         return observation, {"state": state}, x, theta
 
+    def mechanics(self, **parameters: ParameterValue) -> Mechanics:
+        """Return the two joints, the rail's and the hinge, and their forces.
+
+        Parameters
+        ----------
+        **parameters
+            Where they are to differ from the system's own.
+
+        Raises
+        ------
+        MisstepError
+            If there is no such parameter, or its value is of the wrong type or out of range.
+        """
+        changed = {**self.parameters, **parameters}
+        p = build_parameters(self.parameters_type, self.system_id, changed)
+        inertia = p.pole_mass * p.half_length**2
+        typical = {
+            "half_length": p.half_length,
+            "pole_mass": p.pole_mass,
+            "pole_inertia": inertia / 3.0,
+            "gravity": 9.81,
+            # What brakes a swing within about ten periods.
+            "hinge_damping": 0.1 * inertia * math.sqrt(9.81 / p.half_length),
+        }
+        return Mechanics(
+            cartpole_spec(p).compile(), ("x", "theta"), ("x_dot", "theta_dot"), typical, p.delay
+        )
+
     def render(self) -> NDArray[np.uint8] | None:
         """Return a picture of the true state, shape (360, 640, 3), with ``"rgb_array"``."""
         if self.render_mode is None:
@@ -447,7 +484,7 @@ def cartpole_spec(p: CartPoleParameters) -> Any:
 
     spec.body("cart").mass = p.cart_mass
     pole = spec.body("pole")
-    across = p.pole_mass * p.half_length**2 / 3.0
+    across = _inertia_across(p)
     pole.mass = p.pole_mass
     pole.ipos = (0.0, 0.0, p.half_length)
     pole.inertia = (across, across, _AXIAL_INERTIA * across)
@@ -466,12 +503,16 @@ def wrap_angle(angle: float) -> float:
     return wrapped if wrapped > -math.pi else math.pi
 
 
+def _inertia_across(p: CartPoleParameters) -> float:
+    """Return the pole's inertia [kg·m²] about its centre of mass, across its length."""
+    return p.pole_inertia or p.pole_mass * p.half_length**2 / 3.0
+
+
 def _fastest_rate(p: CartPoleParameters) -> float:
     """Return the fastest rate [1/s] at which the pole swings or friction brakes, near upright."""
     coupling = p.pole_mass * p.half_length
-    inertia = np.array(
-        [[p.cart_mass + p.pole_mass, coupling], [coupling, 4.0 / 3.0 * coupling * p.half_length]]
-    )
+    about_hinge = _inertia_across(p) + coupling * p.half_length
+    inertia = np.array([[p.cart_mass + p.pole_mass, coupling], [coupling, about_hinge]])
     braking = np.linalg.eigvals(
         np.linalg.solve(inertia, np.diag([p.cart_damping, p.hinge_damping]))
     )

@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from misstep.costs import StateCost
+from misstep.errors import MisstepError
 from misstep.parameters import ParameterValue
+from misstep.systems.mechanics import Mechanics
 from misstep.trajectory import Column
 
 
@@ -56,3 +58,21 @@ class System(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
     def unwrapped(self) -> "System":
         """The system itself; the one inside where this is a system around a system."""
         return self
+
+    def mechanics(self, **parameters: ParameterValue) -> Mechanics:
+        """Return the joints and their forces, to tell from a motion which actions made it.
+
+        Parameters
+        ----------
+        **parameters
+            Of the system, where they are to differ from its own.
+
+        Raises
+        ------
+        MisstepError
+            If this system cannot be run backwards, or has no such parameter or value.
+        """
+        raise MisstepError(
+            f"{self.system_id} has no inverse dynamics: actions cannot be inferred from its "
+            "motion, nor its equations checked; the cart-poles have"
+        )

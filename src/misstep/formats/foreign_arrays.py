@@ -1,0 +1,172 @@
+"""Arrays in HDF5 files of other projects, read some rows at a time, however they are chunked.
+
+Nothing is taken on trust: links out of the file, filters that are not built into HDF5, and chunks
+larger than memory should hold are refused. Deflated chunks are inflated here, since the HDF5
+library would inflate a few kilobytes into as much memory as they claim.
+"""
+
+import itertools
+import math
+import zlib
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from misstep.errors import MisstepError
+from misstep.formats.hdf5_arrays import member
+from misstep.formats.hdf5_attributes import damage
+
+_LARGEST_CHUNK = 2**26  # bytes, inflated
+_LARGEST_ROW = 2**20  # bytes
+_UNDONE = {h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32}
+_CHECKSUM = 4  # bytes of Fletcher's checksum at the end of a chunk
+
+
+class ForeignArray:
+    """One array of numbers, (rows, ...) of which any rows can be read.
+
+    Parameters
+    ----------
+    group : h5py.Group
+    name : str
+
+    Attributes
+    ----------
+    shape : tuple of int
+
+    Raises
+    ------
+    MisstepError
+        If there is no such array, it holds no numbers, or it is stored in a way that is refused.
+    """
+
+    def __init__(self, group: h5py.Group, name: str) -> None:
+        self._name = name
+        self._dataset: h5py.Dataset = member(group, name, h5py.Dataset)
+        with damage(name):
+            self._check()
+            self.shape: tuple[int, ...] = self._dataset.shape
+            self._dtype: np.dtype[Any] = self._dataset.dtype
+
+    @property
+    def row_width(self) -> int:
+        """Numbers in a row."""
+        return math.prod(self.shape[1:])
+
+    def read(self, start: int, stop: int) -> NDArray[np.float64]:
+        """Return rows `start` to `stop`, shape (b, row_width).
+
+        Raises
+        ------
+        MisstepError
+            If what is stored is damaged.
+        """
+        with damage(self._name):
+            rows = self._plain(start, stop) if self._filters is None else self._own(start, stop)
+            return rows.reshape(stop - start, -1).astype(np.float64)
+
+    def check(self) -> None:
+        """Unpack all of it, so that whoever reads it next with HDF5 makes no more of it.
+
+        Raises
+        ------
+        MisstepError
+            If what is stored is damaged.
+        """
+        if self._filters is not None:
+            rows = self._dataset.chunks[0]
+            for start in range(0, self.shape[0], rows):
+                self.read(start, min(start + rows, self.shape[0]))
+
+    def _check(self) -> None:
+        dataset, name = self._dataset, self._name
+        if not dataset.shape or dataset.dtype.kind not in "fiub" or dataset.dtype.subdtype:
+            raise MisstepError(f"{name} is no array of numbers")
+        if dataset.is_virtual or dataset.external:
+            raise MisstepError(f"{name} lies in another file: only what is in this one is read")
+        if math.prod(dataset.shape[1:]) * dataset.dtype.itemsize > _LARGEST_ROW:
+            raise MisstepError(f"{name} has rows of shape {dataset.shape[1:]}: that is too much")
+        self._filters: list[int] | None = None
+        if dataset.chunks is None:
+            if dataset.id.get_storage_size() < dataset.nbytes:
+                raise MisstepError(f"{name} claims to be longer than what is stored of it")
+            return
+        self._check_chunks()
+
+    def _check_chunks(self) -> None:
+        dataset, name = self._dataset, self._name
+        properties = dataset.id.get_create_plist()
+        filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
+        n_bytes = math.prod(dataset.chunks) * dataset.dtype.itemsize
+        if n_bytes > _LARGEST_CHUNK:
+            raise MisstepError(
+                f"{name} would take up {n_bytes} bytes in one piece: at most {_LARGEST_CHUNK} are "
+                "allowed"
+            )
+        strange = set(filters) - _UNDONE - {h5py.h5z.FILTER_LZF}
+        if strange or (h5py.h5z.FILTER_LZF in filters and n_bytes > 2**24):
+            raise MisstepError(
+                f"{name} is packed with HDF5 filters {sorted(filters)}: rewrite it with gzip, lzf "
+                "or none"
+            )
+        # The library asks for as much memory as a chunk claims to take up in the file.
+        most = n_bytes + n_bytes // 100 + 1024
+        if dataset.id.chunk_iter(lambda chunk: chunk.size > most or None) is not None:
+            raise MisstepError(f"{name} has a chunk that takes up more than it holds")
+        chunks = math.prod(-(-n // c) for n, c in zip(dataset.shape, dataset.chunks, strict=True))
+        if dataset.id.get_num_chunks() < chunks:
+            raise MisstepError(f"{name} claims to be longer than what is stored of it")
+        if filters and set(filters) <= _UNDONE:
+            self._filters = filters
+
+    def _plain(self, start: int, stop: int) -> NDArray[Any]:
+        return np.asarray(self._dataset[start:stop])
+
+    def _own(self, start: int, stop: int) -> NDArray[Any]:
+        """Return rows whose chunks are unpacked here."""
+        chunk = self._dataset.chunks
+        rows = np.empty((stop - start, *self.shape[1:]), self._dtype)
+        corners = [
+            range(start - start % chunk[0], stop, chunk[0]),
+            *(range(0, n, c) for n, c in zip(self.shape[1:], chunk[1:], strict=True)),
+        ]
+        for corner in itertools.product(*corners):
+            block = self._chunk(corner)
+            first, last = max(corner[0], start), min(corner[0] + chunk[0], stop)
+            rest = tuple(
+                slice(at, min(at + c, n))
+                for at, c, n in zip(corner[1:], chunk[1:], self.shape[1:], strict=True)
+            )
+            inside = tuple(slice(0, part.stop - part.start) for part in rest)
+            rows[(slice(first - start, last - start), *rest)] = block[
+                (slice(first - corner[0], last - corner[0]), *inside)
+            ]
+        return rows
+
+    def _chunk(self, corner: tuple[int, ...]) -> NDArray[Any]:
+        skipped, stored = self._dataset.id.read_direct_chunk(corner)
+        size = math.prod(self._dataset.chunks)
+        n_bytes = size * self._dtype.itemsize
+        for place in reversed(range(len(self._filters or ()))):
+            if not skipped >> place & 1:
+                stored = _undo(self._filters[place], stored, n_bytes, self._dtype.itemsize)  # type: ignore[index]
+        if len(stored) != n_bytes:
+            raise MisstepError(f"a chunk holds {len(stored)} bytes, not {n_bytes}")
+        return np.frombuffer(stored, self._dtype).reshape(self._dataset.chunks)
+
+
+def _undo(kind: int, stored: bytes, n_bytes: int, itemsize: int) -> bytes:
+    """Undo one filter of a chunk of `n_bytes`, never making more than those and a checksum."""
+    if kind == h5py.h5z.FILTER_FLETCHER32:
+        return stored[:-_CHECKSUM]
+    if kind == h5py.h5z.FILTER_DEFLATE:
+        inflater = zlib.decompressobj()
+        plain = inflater.decompress(stored, n_bytes + _CHECKSUM + 1)
+        if not inflater.eof:
+            raise MisstepError("a compressed array is longer or shorter than it has to be")
+        return plain
+    # Shuffled: first the first byte of every number, then all second bytes, and so on.
+    planes = np.frombuffer(stored, np.uint8).reshape(itemsize, -1)
+    return np.ascontiguousarray(planes.T).tobytes()
