@@ -219,7 +219,12 @@ def test_quick_makes_fewer_repetitions_and_the_same_ones(spec):
     study = load_study(spec)
     cases = [replace(study.cases[0], seeds=n) for n in (1, 2, 20, 100, 200)]
     quick = replace(study, cases=tuple(cases)).quick()
-    assert [case.seeds for case in quick.cases] == [1, 2, 2, 2, 4]
+    assert [case.seeds for case in quick.cases] == [1, 1, 1, 2, 4]
+    assert not quick.videos
+    assert {cell.tests for cell in quick.cells} == {2}
+    assert {cell.key for cell in quick.cells} < {
+        cell.key for cell in replace(study, cases=tuple(cases)).cells
+    }
 
 
 def test_the_studies_that_come_along_can_be_read():

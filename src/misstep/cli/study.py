@@ -35,7 +35,7 @@ def study(
         ),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="One repetition in 50, but at least two.")
+        bool, typer.Option("--quick", help="One repetition in 50, two tests, no videos.")
     ] = False,
     json: JsonFile = None,
 ) -> int:

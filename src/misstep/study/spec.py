@@ -41,8 +41,8 @@ from misstep.learners import LEARNERS, Task
 from misstep.parameters import ParameterValue, build_parameters
 from misstep.systems import make_system
 
-QUICK = 50
-"""A quick study makes one repetition in so many, but at least two."""
+QUICK, MOST_QUICK_TESTS = 50, 2
+"""A quick study makes one repetition in so many, but at least one, and no more tests than this."""
 
 _NAME = re.compile(r"\w[\w .+-]*")
 _KINDS = {
@@ -173,11 +173,14 @@ class Study:
         ]
 
     def quick(self) -> "Study":
-        """Return the study with one repetition in 50, but at least two (and no more than asked)."""
+        """Return the study with one repetition in 50, but at least one, few tests and no videos."""
         cases = (
-            replace(case, seeds=min(case.seeds, max(2, case.seeds // QUICK))) for case in self.cases
+            replace(
+                case, seeds=max(1, case.seeds // QUICK), tests=min(case.tests, MOST_QUICK_TESTS)
+            )
+            for case in self.cases
         )
-        return replace(self, cases=tuple(cases))
+        return replace(self, cases=tuple(cases), videos=False)
 
     def to_json(self) -> dict[str, Any]:
         """Return all of it as plain values."""
