@@ -26,7 +26,6 @@ from misstep.cli import (
     evaluate,
     inspect,
     learn,
-    live,
     mark,
     record,
     reproduce,
@@ -76,7 +75,6 @@ def misstep(
 for _module in (
     record,
     learn,
-    live,
     evaluate,
     inspect,
     mark,
