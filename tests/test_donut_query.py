@@ -12,7 +12,6 @@ from misstep.mixture import (
     DonutMixture,
     DonutQuery,
     GaussianMixture,
-    compiled,
     exploration_from_variance,
     reference,
 )
@@ -79,19 +78,6 @@ def test_a_flat_start_stays_where_asked(random_mixture):
     assert action == far
     query.explore(np.zeros(1), action, warm=True)
     assert abs(action[0]) < 100.0
-
-
-def test_the_call_without_scratch_is_the_same(random_mixture):
-    rng = np.random.default_rng(1)
-    conditioner = conditioner_of(random_mixture(rng, 4, 3), 2)
-    query = DonutQuery(conditioner, [0.7])
-    state, one, other = rng.normal(size=2), np.zeros(1), np.zeros(1)
-    with_scratch = query.explore(state, one, warm=False)
-    arrays = query._arrays[:-1]
-    assert with_scratch == compiled.explore(
-        state, other, False, False, False, 2.0, 2.0, np.array([0.7]), *arrays
-    )
-    assert one == other
 
 
 @pytest.mark.parametrize(

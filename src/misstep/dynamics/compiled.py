@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from misstep.costs import EFFORT, FREE_SHARE, WALL, StateCost
 from misstep.errors import MisstepError
-from misstep.mixture.compiled import REORDER, exp_block
+from misstep.mixture.compiled import REORDER
+from misstep.mixture.elementary import exp_nonpositive
 
 Array = NDArray[np.float64]
 
@@ -147,7 +148,6 @@ class Workspace(NamedTuple):
     encoded: Array
     exponent: Array
     basis: Array
-    bits: NDArray[np.int64]
     weighted: Array
     states: Array
     new_states: Array
@@ -171,12 +171,10 @@ class Workspace(NamedTuple):
         """Make room for plans of `horizon` steps."""
         n, m = len(model.angles), model.n_actions
         nz, n_centres = model.centres.shape
-        basis = np.empty(n_centres)
         return cls(
             encoded=np.empty(nz),
             exponent=np.empty(n_centres),
-            basis=basis,
-            bits=basis.view(np.int64),
+            basis=np.empty(n_centres),
             weighted=np.empty(n_centres),
             states=np.empty((horizon + 1, n)),
             new_states=np.empty((horizon + 1, n)),
@@ -231,7 +229,9 @@ def _evaluate_basis(model, state, work):
         row = model.centres[k]
         for d in range(n_centres):
             exponent[d] += v * row[d]
-    exp_block(exponent, work.basis, work.bits, n_centres)
+    basis = work.basis
+    for d in range(n_centres):
+        basis[d] = exp_nonpositive(exponent[d])
 
 
 @njit(**_INLINED)

@@ -22,9 +22,14 @@ from misstep.learners.mixtures import (
     check_choice,
     restore_mixture,
 )
-from misstep.mixture import DonutMixture, GaussianMixture, compiled, exploration_from_variance
+from misstep.mixture import (
+    DonutMixture,
+    DonutQuery,
+    GaussianMixture,
+    exploration_from_variance,
+)
 from misstep.mixture.donut import DEFAULT_K, DEFAULT_REACH, check_family
-from misstep.mixture.donut_mixture import FORMULAS, component_arrays
+from misstep.mixture.donut_mixture import FORMULAS
 from misstep.parameters import check_parameters, parameter
 from misstep.trajectory import Trajectory
 
@@ -125,22 +130,10 @@ class DonutPolicy(MixturePolicy):
         settings: DonutSettings,
     ) -> None:
         super().__init__(task, mixture)
-        m = len(task.action_columns)
-        if scale.shape != (m,) or not np.all((scale > 0) & (scale < np.inf)):
-            raise MisstepError(f"the policy's scale must be {m} positive numbers, got {scale}")
-        check_family(settings.k, settings.reach)
+        k, reach, _, formula = settings
+        self._query = DonutQuery(self.conditioner, scale, k, reach, formula)
         self.scale = scale
         self.settings = settings
-        c = self.conditioner
-        self._arrays = (
-            c.state_constants,
-            c.state_means,
-            c.state_whiteners,
-            c.gains,
-            c.action_means,
-            c.covariances,
-            *component_arrays(c.covariances),
-        )
         self.reset()
 
     def reset(self) -> None:
@@ -151,20 +144,10 @@ class DonutPolicy(MixturePolicy):
 
     def __call__(self, observation: Array, /) -> Array:
         """Return the mode, clipped; the next climb starts from there."""
-        k, reach, climb, formula = self.settings
+        climb = self.settings.climb
         state = self.state_of(observation)
         warm = climb != "global" and not self._first
-        self.exploration = compiled.explore(
-            state,
-            self._action,
-            warm,
-            climb == "density",
-            formula == "printed",
-            k,
-            reach,
-            self.scale,
-            *self._arrays,
-        )
+        self.exploration = self._query.explore(state, self._action, warm, climb == "density")
         self._first = False
         possible = self.clipped(self._action)
         if not warm and not np.array_equal(possible, self._action):

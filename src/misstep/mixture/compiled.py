@@ -15,21 +15,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from misstep.mixture.elementary import CONTRACT, exp_nonpositive
-
 Array = NDArray[np.float64]
 
 REORDER = {"reassoc", "contract", "nsz", "arcp"}
 _COMPILED: dict[str, Any] = {"cache": True, "nogil": True, "_nrt": False}
 _INLINED: dict[str, Any] = {"forceinline": True, "_nrt": False}
 LOG_2PI = math.log(2.0 * math.pi)
-
-
-@njit(fastmath=CONTRACT, forceinline=True)
-def exp_block(z, out, bits, count):
-    """Write exp(z) into `out` for the first `count` entries; z ≤ 0; see `exp_nonpositive`."""
-    for i in range(count):
-        out[i] = exp_nonpositive(z[i])
 
 
 @njit(**_COMPILED)
@@ -464,14 +455,4 @@ def answer(
         if math.exp(value) == 0.0:
             return exploration
     ascend(action, h, m, whiteners, log_norms, shape, scratch)
-    return exploration
-
-
-def explore(
-    state: Array, action: Array, warm: bool, flat_stays: bool, printed: bool, *rest: Any
-) -> float:
-    """`answer` for callers that bring no scratch."""
-    exploration: float = answer(
-        state, action, warm, flat_stays, printed, *rest, scratch_for(len(rest[-1]), len(action))
-    )
     return exploration
