@@ -174,6 +174,14 @@ def test_widest_gap_repeats_what_has_succeeded():
     assert strength_of("widest-gap", [success]) == pytest.approx(1.7, abs=0.05)
 
 
+@pytest.mark.parametrize("learner", ["donut", "balanced-mean", "widest-gap"])
+def test_a_demonstration_that_succeeded_is_repeated_among_failures(learner):
+    shown = [stroke(s) for s in (1.0, 1.3, 2.5)]
+    success = stroke(1.7, outcome=Outcome.SUCCESS)
+    assert abs(strength_of(learner, shown) - 1.7) > 0.05
+    assert strength_of(learner, [*shown, success]) == pytest.approx(1.7, abs=0.05)
+
+
 @pytest.mark.parametrize("learner", BETWEEN)
 def test_an_attempt_may_push_against_a_limit_or_stop_at_once(learner):
     # A strike that is told to stop at its first step, and one at full speed all along.

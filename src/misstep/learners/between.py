@@ -110,18 +110,21 @@ class _Blend(MixtureParameters):
 class BalancedMean(_Blend):
     """Rung 1: the mean of all failures, every demonstrator with an equal say (reconstructed).
 
-    The first trial weighs all demonstrators equally, later ones by a Bayesian bootstrap.
+    The first trial weighs all demonstrators equally, later ones by a Bayesian bootstrap. Where
+    demonstrations succeeded, it is the mean of those.
     """
 
     learner: ClassVar[str] = "balanced-mean"
 
     def policy(self, task: Task, evidence: Evidence, rng: np.random.Generator) -> BlendPolicy:
         """Return the balanced mean."""
-        who = [t.provenance.demonstrator for t in evidence.demonstrations]
+        shown = evidence.demonstrations
+        shown = tuple(t for t in shown if t.outcome is Outcome.SUCCESS) or shown
+        who = [t.provenance.demonstrator for t in shown]
         say = np.array([1.0 / who.count(name) for name in who])
         if evidence.trials:
             say = say * rng.exponential(size=len(say))
-        mixtures = self.mixtures(task, evidence.demonstrations, rng)
+        mixtures = self.mixtures(task, shown, rng)
         return BlendPolicy(task, mixtures, say / say.sum())
 
 

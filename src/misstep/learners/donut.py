@@ -31,12 +31,14 @@ from misstep.mixture import (
 from misstep.mixture.donut import DEFAULT_K, DEFAULT_REACH, check_family
 from misstep.mixture.donut_mixture import FORMULAS
 from misstep.parameters import check_parameters, parameter
-from misstep.trajectory import Trajectory
+from misstep.trajectory import Outcome, Trajectory
 
 Array = NDArray[np.float64]
 
 # How far demonstrated actions spread, times this, is the disagreement that counts as half.
 SCALE_SHARE = 0.3
+# s beside which any disagreement is none.
+NO_EXPLORATION = 1e9
 CLIMBS = ("warm", "density", "global")
 
 
@@ -204,8 +206,11 @@ class DonutLearner(DonutParameters, SpacedMixtureParameters):
             )
 
     def policy(self, task: Task, evidence: Evidence, rng: np.random.Generator) -> DonutPolicy:
-        """Return the donut policy on all attempts."""
-        mixture = self.fit_attempts(task, evidence.attempts, rng)
+        """Return the donut policy on all attempts; once some succeeded, the mode of those."""
+        succeeded = [t for t in evidence.attempts if t.outcome is Outcome.SUCCESS]
+        mixture = self.fit_attempts(task, succeeded or evidence.attempts, rng)
+        if succeeded:
+            return replace(self, scale=NO_EXPLORATION).act_on(task, mixture, ())
         turn = (0.0, -1.0, 1.0)[len(evidence.trials) % 3]
         reach = self.reach * (1.0 + turn * self.variation)
         return replace(self, reach=reach, variation=0.0).act_on(
