@@ -13,12 +13,13 @@ demo: $(READY)  ## The paper, from five sets of failed demonstrations; ends with
 	$(BIN)/misstep reproduce --quick --out $(OUT)
 
 test: $(READY) check  ## Every check and every test.
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --ignore tests/test_hot_paths.py
 
-check: $(READY)  ## Lint, format, types.
+check: $(READY)  ## Lint, format, types, and how many instructions the two hot paths take.
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/pytest -q tests/test_hot_paths.py
 
 format: $(READY)  ## Mend what can be mended by a machine.
 	$(BIN)/ruff check --fix .

@@ -8,8 +8,12 @@
     record.py         demonstrate
     learn.py          learn, resume
     evaluate.py       evaluate
+    inspect.py        inspect
+    mark.py           mark
+    convert.py        convert
     reproduce.py      reproduce
     study.py          study
+    bench.py          bench
     catalogue.py      list
 
 A command imports what it needs when it runs: ``misstep --help`` must not wait for the physics and
