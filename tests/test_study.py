@@ -404,10 +404,12 @@ def test_one_worker_killed_and_resumed_gives_the_same_tables(whole, tmp_path):
 
 
 def test_a_learner_that_takes_long_makes_the_first_of_the_seeds_and_tests(tmp_path):
-    text = GOOD.replace('"donut"', '{ name = "donut", seeds = 1, tests = 0 }')
+    donut = '{ name = "donut", called = "hole", with = { reach = 3 }, seeds = 1, tests = 0 }'
+    text = GOOD.replace('"donut"', donut)
     cells = [c for c in load_study(write(tmp_path, text)).cells if c.case.name == "balance"]
-    made = [(c.learner.name, c.repetition, c.tests) for c in cells]
-    assert made == 2 * [("donut", 0, 0), ("fall", 0, 2), ("fall", 1, 2)]
+    made = [(c.learner.label, c.repetition, c.tests) for c in cells]
+    assert made == 2 * [("hole", 0, 0), ("fall", 0, 2), ("fall", 1, 2)]
+    assert {c.learner.full_name for c in cells} == {"donut(reach=3)", "fall"}
 
 
 def test_a_folder_remembers_its_whole_study(whole, spec):

@@ -20,7 +20,8 @@
     learners = ["fall", { name = "donut", with = { reach = 3 } }, { name = "cma-es", seeds = 20 }]
 
 A case may set ``seeds``, ``max_trials`` and ``tests`` for itself, and a learner that takes long
-fewer ``seeds`` and ``tests`` than its case: the first of them. Of a case only ``name``,
+fewer ``seeds`` and ``tests`` than its case: the first of them. Tables show a learner with its
+parameters, or as it is ``called``. Of a case only ``name``,
 ``system``, ``demonstrators`` and ``learners`` are necessary. Everything is built once while the
 file is read, so that a mistake is told before anything runs.
 """
@@ -78,7 +79,7 @@ _CASE: dict[str, type] = {
     "tests": int,
 }
 _DEMONSTRATOR: dict[str, type] = {"name": str, "with": dict}
-_LEARNER: dict[str, type] = {**_DEMONSTRATOR, "seeds": int, "tests": int}
+_LEARNER: dict[str, type] = {**_DEMONSTRATOR, "seeds": int, "tests": int, "called": str}
 
 
 @dataclass(frozen=True)
@@ -91,9 +92,16 @@ class Choice:
     """Repetitions with this learner, where they are fewer than the case's."""
     tests: int | None = None
     """Tests of its final policies, likewise."""
+    called: str = ""
+    """What tables call it, where that is not its name and parameters."""
 
     @property
     def label(self) -> str:
+        """What tables call it."""
+        return self.called or self.full_name
+
+    @property
+    def full_name(self) -> str:
         """The name, followed by the parameters: ``donut(reach=3)``."""
         return f"{self.name}({settings(self.parameters)})" if self.parameters else self.name
 
@@ -304,8 +312,11 @@ def _choices(entry: Mapping[str, Any], key: str, keys: Mapping[str, type]) -> tu
             )
         with _inside(key):
             _check_table(table, keys, required=("name",))
-        numbers = {name: table.get(name) for name in ("seeds", "tests")}
-        choices.append(Choice(table["name"], table.get("with", {}), **numbers))
+        own = {name: table[name] for name in ("seeds", "tests", "called") if name in table}
+        if "called" in own:
+            with _inside("called"):
+                _check_name(own["called"])
+        choices.append(Choice(table["name"], table.get("with", {}), **own))
     if not choices:
         raise MisstepError(f"{key} is empty: name at least one")
     _check_distinct(key, [choice.label for choice in choices])
