@@ -1,12 +1,20 @@
 """Files with damage, for readers that have to refuse it or make something of it."""
 
+import os
 import shutil
 from pathlib import Path
 
+from hypothesis import settings
 from hypothesis import strategies as st
 
 from misstep import MisstepError
 from misstep.formats import read_episodes
+
+
+def fuzzed(usual):
+    """Return how many damaged inputs to try: `usual`, or what a nightly run asks for."""
+    told = os.environ.get("MISSTEP_FUZZED_INPUTS")
+    return int(told) if told else usual * settings().max_examples // 100
 
 
 @st.composite

@@ -263,7 +263,7 @@ NOWHERE = ("--out", "D.h5/sub/x.h5")  # below a file: even the administrator can
     ("words", "told"),
     [
         ((), ["command", "--help"]),
-        (("dance",), ["'dance'", "demonstrate, learn, resume, evaluate, inspect, mark, convert"]),
+        (("dance",), ["'dance'", "demonstrate, learn, resume", "inspect, mark, convert"]),
         (("learn", "--speed", "3"), ["--speed", "--learner, --state, --max-trials"]),
         (("learn",), ["SYSTEM", "misstep learn --help"]),
         (("learn", "cartpole", "--from"), ["--from", "argument"]),

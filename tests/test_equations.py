@@ -1,9 +1,11 @@
 import math
+from itertools import product
 
 import numpy as np
 import pytest
 from attempts import DT, attempt, heavy, recording
 
+from misstep import demonstrate
 from misstep.errors import MisstepError
 from misstep.recordings.equations import check_equations
 from misstep.systems import make_system
@@ -180,3 +182,13 @@ def test_what_does_not_move_cannot_be_checked():
 def test_only_systems_that_can_be_run_backwards(attempts):
     with pytest.raises(MisstepError, match="basket has no inverse dynamics"):
         check_equations(shown(attempts), make_system("basket"))
+
+
+def test_turns_at_a_low_rate_are_no_spikes():
+    # A hand that jerks: at 50 Hz the velocity turns within one row.
+    system = make_system("cartpole")
+    for by, seed in product(("weak", "delayed", "reversed", "random", "noisy"), range(2)):
+        for check in check_equations(demonstrate(system, by=by, n=3, seed=seed), system):
+            assert check.holds
+            assert not check.findings
+            assert not check.fits

@@ -20,7 +20,7 @@ from misstep import formats
 from misstep.errors import MisstepError
 from misstep.formats import FORMATS, append_trajectory, format, load_dataset, save_dataset
 from misstep.formats.format import Block, Ending, Episode, Header
-from misstep.formats.hdf5_arrays import RowReader
+from misstep.formats.hdf5.arrays import RowReader
 from misstep.trajectory import Column, Dataset, Outcome, Provenance, Trajectory
 
 COLUMNS = (Column("x", "m"), Column("theta", "rad"))

@@ -6,7 +6,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
-from mutations import mutations, survives
+from mutations import fuzzed, mutations, survives
 
 from misstep import Column, Dataset, Outcome, Provenance, Trajectory
 from misstep.formats import FORMATS, load_dataset, read_episodes, save_dataset
@@ -285,7 +285,7 @@ def test_times_that_do_not_fit_are_noted(tmp_path):
 
 
 @pytest.mark.parametrize("format", VERSIONS.values())
-@settings(max_examples=50)
+@settings(max_examples=fuzzed(50))
 @given(mutation=mutations())
 def test_damage(tmp_path_factory, format, mutation):
     folder = tmp_path_factory.getbasetemp()

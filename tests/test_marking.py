@@ -235,3 +235,17 @@ def test_a_person_marks_at_a_terminal(file):
     after = load_dataset(file)
     assert (after[1].outcome, after[1].n_steps) == (Outcome.UNKNOWN, 15)
     assert [step.episode for step in history(file)] == [2]
+
+
+def test_a_file_of_another_make_is_never_rewritten(demonstrations, tmp_path, refused):
+    path = tmp_path / "can.hdf5"
+    save_dataset(demonstrations, path, format="robomimic")
+    before = path.read_bytes()
+    for change in (lambda: mark_episode(path, 1, Mark(failure_time=0.4)), lambda: undo(path)):
+        with refused(r"robomimic HDF5, which cannot hold marks.*misstep convert .*can\.h5"):
+            change()
+    assert path.read_bytes() == before
+    assert not history_folder(path).exists()
+    other = path.rename(tmp_path / "can.h5")
+    with refused(r"misstep convert .*can-marked\.h5"):
+        mark_episode(other, 1, Mark(failure_time=0.4))

@@ -5,10 +5,11 @@ import h5py
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from mutations import mutations, survives
+from mutations import fuzzed, mutations, survives
 
 from misstep import Column, Dataset, Outcome, Provenance, Trajectory
-from misstep.formats import ReadOptions, hdf5_texts, load_dataset, read_episodes, save_dataset
+from misstep.formats import ReadOptions, load_dataset, read_episodes, save_dataset
+from misstep.formats.hdf5 import texts
 
 
 def make(steps=5, seed=0, names=("eef_pos_0", "eef_pos_1", "gripper"), **changes):
@@ -196,7 +197,7 @@ def test_a_small_file_does_not_become_a_large_one(tmp_path, refused):
 
 def test_damaged_texts_crash_nothing(tmp_path, refused, monkeypatch):
     # With the wrong size of the text, the HDF5 library (2.0.0) goes round in circles for ever.
-    monkeypatch.setattr(hdf5_texts, "_SECONDS", 4)
+    monkeypatch.setattr(texts, "_SECONDS", 4)
     path = tmp_path / "can.hdf5"
     as_documented(path, images=False)
     whole = bytearray(path.read_bytes())
@@ -207,7 +208,7 @@ def test_damaged_texts_crash_nothing(tmp_path, refused, monkeypatch):
         load_dataset(path)
 
 
-@settings(max_examples=60)
+@settings(max_examples=fuzzed(60))
 @given(mutation=mutations())
 def test_damage(tmp_path_factory, mutation):
     folder = tmp_path_factory.getbasetemp()
@@ -215,3 +216,14 @@ def test_damage(tmp_path_factory, mutation):
     if not os.path.exists(whole):
         save_dataset(Dataset([make(), make(300, costs=None)]), whole, format="robomimic")
     survives(whole, folder / "damaged_robomimic.h5", mutation)
+
+
+@settings(max_examples=fuzzed(8))
+@given(mutation=mutations())
+def test_damage_to_a_file_of_others(tmp_path_factory, mutation):
+    # With texts of variable length, which another process reads.
+    folder = tmp_path_factory.getbasetemp()
+    whole = folder / "others.hdf5"
+    if not os.path.exists(whole):
+        as_documented(whole, images=False)
+    survives(whole, folder / "damaged_others.hdf5", mutation, format="robomimic")

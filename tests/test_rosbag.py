@@ -7,15 +7,16 @@ import sys
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from mutations import mutations, survives
+from mutations import fuzzed, mutations, survives
 from rosbags import rosbag1, rosbag2
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from misstep import Column, Dataset, MisstepError, Outcome, Provenance, Trajectory
 from misstep.formats import ReadOptions, load_dataset, read_episodes, save_dataset
-from misstep.formats.bag_clock import Clock
-from misstep.formats.bag_places import parse_place
+from misstep.formats.bags import opening
+from misstep.formats.bags.clock import Clock
+from misstep.formats.bags.places import parse_place
 from misstep.formats.format import BLOCK_ROWS, joined
 
 SUFFIXES = {"rosbag": ".bag", "rosbag2": ".ros2", "mcap": ".mcap"}
@@ -434,7 +435,7 @@ def test_places_are_written_as_they_are_read():
 
 
 @pytest.mark.parametrize(("kind", "suffix"), SUFFIXES.items())
-@settings(max_examples=40)
+@settings(max_examples=fuzzed(40))
 @given(mutation=mutations())
 def test_damage(tmp_path_factory, kind, suffix, mutation):
     folder = tmp_path_factory.getbasetemp()
@@ -442,3 +443,68 @@ def test_damage(tmp_path_factory, kind, suffix, mutation):
     if not whole.exists():
         save_dataset(Dataset([make(), make(30, costs=None)]), whole)
     survives(whole, folder / f"damaged{suffix}", mutation, format=kind)
+
+
+def packed_bag(folder, kind, size):
+    """Write a bag whose messages are packed, one of them `size` equal bytes long."""
+    is_ros1 = kind.startswith("ROS 1")
+    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    path = folder / ("d.bag" if is_ros1 else "d.ros2")
+    if is_ros1:
+        writer = rosbag1.Writer(path)
+        writer.set_compression(writer.CompressionFormat[kind.split()[-1]])
+    else:
+        storage = rosbag2.StoragePlugin.MCAP if "MCAP" in kind else rosbag2.StoragePlugin.SQLITE3
+        writer = rosbag2.Writer(path, version=8, storage_plugin=storage)
+        mode = rosbag2.CompressionMode[kind.split()[-1]]
+        writer.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
+    serialize = store.serialize_ros1 if is_ros1 else store.serialize_cdr
+    with writer:
+        for topic, name, fields in (
+            ("/value", "std_msgs/msg/Float64", [{"data": float(i)} for i in range(9)]),
+            ("/text", "std_msgs/msg/String", [{"data": "0" * size}]),
+        ):
+            connection = writer.add_connection(topic, name, typestore=store)
+            for i, field in enumerate(fields):
+                writer.write(
+                    connection, 10**7 * (i + 1), serialize(store.types[name](**field), name)
+                )
+    return path
+
+
+KINDS = (
+    "ROS 1, BZ2",
+    "ROS 1, LZ4",
+    "ROS 2, MESSAGE",
+    "ROS 2, FILE",
+    "ROS 2, MCAP, STORAGE",
+    "ROS 2, MCAP, FILE",
+)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_packed_bags_are_read(tmp_path, kind):
+    path = packed_bag(tmp_path, kind, 10)
+    (episode,) = read_episodes(path, ReadOptions(observations=("/value.data",)))
+    assert joined(episode).observations[:, 0].tolist() == list(range(9))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_bombs_are_refused(tmp_path, refused, monkeypatch, kind):
+    for name in ("_LARGEST_CHUNK", "_SMALL"):
+        monkeypatch.setattr(opening, name, 2**16)
+    path = packed_bag(tmp_path, kind, 2**23)
+    with refused("unpacks to more than|bytes is too large"):
+        list(read_episodes(path, ReadOptions(observations=("/value.data", "/text.data"))))
+
+
+def test_a_piece_unpacks_to_what_was_packed_or_not_at_all(refused):
+    from lz4 import frame
+
+    packed = frame.compress(b"misstep" * 100)
+    assert opening._unpacked(opening._lz4(), packed) == b"misstep" * 100
+    for damaged in (packed[:-4], packed + b"more"):
+        with refused("longer or shorter than it has to be"):
+            opening._unpacked(opening._lz4(), damaged)
+    with refused("unpacks to more than 699 bytes"):
+        opening._unpacked(opening._lz4(), packed, 699)

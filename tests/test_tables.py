@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mutations import fuzzed
 from peak_memory import needs_status, run_with_peak
 
 from misstep import Column, Dataset, MisstepError, Outcome, Provenance, Trajectory
@@ -26,7 +27,6 @@ from misstep.formats import (
 from misstep.formats.format import Block, Ending, Episode, Header, joined
 
 SUFFIXES = ("csv", "tsv", "parquet")
-FUZZED = int(os.environ.get("MISSTEP_FUZZED_INPUTS", 3 * settings().max_examples))
 COLUMNS = (Column("x", "m"), Column("theta", "rad"))
 
 
@@ -442,7 +442,7 @@ def test_damaged_files_are_read_or_refused(tmp_path, suffix):
     path, whole = tmp_path / f"a.{suffix}", image(suffix)
     refusals = []
 
-    @settings(max_examples=FUZZED)
+    @settings(max_examples=fuzzed(300))
     @given(edits, st.sampled_from([None, 50.0]))
     def check(changes, rate):
         path.write_bytes(edited(whole, changes))

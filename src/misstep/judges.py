@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
 from misstep.trajectory import Column
+from misstep.units import UNITS
 
 Observation = NDArray[np.float64]
 Judge = str | Callable[[Observation], Any]
@@ -136,25 +137,7 @@ def _joined(first: Formula, word: str, second: Formula) -> str:
     return f"{origin}({a}) {word} ({b})"
 
 
-# Unit by unit: the one it is converted to, and how many of those it is.
-_UNITS: dict[str, tuple[str, float]] = {
-    "m": ("m", 1.0),
-    "cm": ("m", 0.01),
-    "mm": ("m", 0.001),
-    "rad": ("rad", 1.0),
-    "deg": ("rad", math.pi / 180.0),
-    "s": ("s", 1.0),
-    "ms": ("s", 0.001),
-    "N": ("N", 1.0),
-    "kg": ("kg", 1.0),
-    "g": ("kg", 0.001),
-    "m/s": ("m/s", 1.0),
-    "cm/s": ("m/s", 0.01),
-    "mm/s": ("m/s", 0.001),
-    "rad/s": ("rad/s", 1.0),
-    "deg/s": ("rad/s", math.pi / 180.0),
-}
-_LONGEST_FIRST = sorted(_UNITS, key=len, reverse=True)
+_LONGEST_FIRST = sorted(UNITS, key=len, reverse=True)
 
 _SPACE = re.compile(r"\s*")
 _NUMBER = re.compile(r"([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -293,7 +276,7 @@ class _Parser:
             return _Token("number", number[0], start, unit[0]), unit.end()
         name = _NAME.match(self._text, at)
         if name and name[0] not in _KEYWORDS:
-            self._fail(at, f"{name[0]!r} is no unit; there are: {', '.join(_UNITS)}")
+            self._fail(at, f"{name[0]!r} is no unit; there are: {', '.join(UNITS)}")
         return _Token("number", number[0], start), end
 
     @property
@@ -521,12 +504,12 @@ def _common_unit(aligned: Sequence[_Node]) -> str | None:
 
 def _base(unit: str | None) -> str | None:
     """Return the unit that `unit` is converted to; itself if it is not known."""
-    return unit if unit is None or unit not in _UNITS else _UNITS[unit][0]
+    return unit if unit is None or unit not in UNITS else UNITS[unit][0]
 
 
 def _converted(node: _Node, unit: str | None) -> _Node:
     """Return the node in another unit of the same base."""
     if node.unit is None or unit is None or node.unit == unit:
         return node
-    factor, value = _UNITS[node.unit][1] / _UNITS[unit][1], node.value
+    factor, value = UNITS[node.unit][1] / UNITS[unit][1], node.value
     return replace(node, value=lambda row: factor * value(row), unit=unit)

@@ -23,8 +23,11 @@ def list_(
     check_output_file(json, "--json")
     entries = _CATALOGUES[what]()
     write_result(json, {"parameters": {"what": what}, what: entries})
+    if what == "formats":
+        _print_formats(entries)
+        return 0
     for name, entry in entries.items():
-        print(_heading(name, entry))
+        print(f"{name}: {entry['summary']}")
         if entry.get("parameters"):
             rows = [ParameterRow(**row) for row in entry["parameters"]]
             cells = [(r.name, _default(r), r.unit, r.meaning) for r in rows]
@@ -56,7 +59,18 @@ def _demonstrators() -> dict[str, dict[str, Any]]:
 def _formats() -> dict[str, dict[str, Any]]:
     from misstep import FORMATS
 
-    return {name: {"suffixes": list(entry.suffixes)} for name, entry in FORMATS.items()}
+    return {
+        name: {
+            "summary": entry.description,
+            "suffixes": list(entry.suffixes),
+            "read_suffixes": list(entry.read_suffixes),
+            "folder": entry.is_folder,
+            "reads": entry.read is not None,
+            "writes": entry.write is not None,
+            "extra": entry.extra,
+        }
+        for name, entry in FORMATS.items()
+    }
 
 
 _CATALOGUES: dict[str, Callable[[], dict[str, dict[str, Any]]]] = {
@@ -72,10 +86,25 @@ def _describe(kind: type, parameters: type) -> dict[str, Any]:
     return {"summary": summary, "parameters": [r._asdict() for r in parameter_table(parameters)]}
 
 
-def _heading(name: str, entry: dict[str, Any]) -> str:
-    if "suffixes" in entry:
-        return f"{name}: {', '.join(entry['suffixes'])}"
-    return f"{name}: {entry['summary']}"
+def _print_formats(entries: dict[str, dict[str, Any]]) -> None:
+    cells = [
+        (
+            name,
+            "read, write" if entry["writes"] else "read",
+            _places(entry),
+            f"misstep[{entry['extra']}]" if entry["extra"] else "-",
+            entry["summary"],
+        )
+        for name, entry in entries.items()
+    ]
+    print_table(("format", "can", "suffix", "needs", "what it is"), cells)
+
+
+def _places(entry: dict[str, Any]) -> str:
+    """Return the suffixes; in parentheses those that are looked into."""
+    others = [f"({suffix})" for suffix in entry["read_suffixes"]]
+    places = " ".join([*entry["suffixes"], *others])
+    return places or ("any folder" if entry["folder"] else "-")
 
 
 def _default(row: ParameterRow) -> str:

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -10,6 +10,13 @@ from misstep.cli.options import JsonFile, parse_parameters
 from misstep.cli.output import check_output_file, write_result
 from misstep.cli.progress import progress
 from misstep.errors import MisstepError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from misstep.recordings.checking import Beginnings
+    from misstep.recordings.pipeline import Plan, Summary
+    from misstep.trajectory import Column
 
 
 def convert(
@@ -118,12 +125,13 @@ def convert(
         float, typer.Option(metavar="S", help="Seconds that it must have held by then.")
     ] = 0.0,
     angles: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="HOW",
             help="Columns in rad: recorded, wrapped to -pi..pi, or unwrapped.",
+            show_default="wrapped with inverse-dynamics, else recorded",
         ),
-    ] = "recorded",
+    ] = None,
     only: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Part of the episodes: a filter key of robomimic."),
@@ -148,8 +156,8 @@ def convert(
 ) -> int:
     """Convert recordings, of any size, and fill in what they lack.
 
-    What is inferred or changed is noted in the result, and printed. Nothing is lost silently, and
-    nothing is left half-written.
+    What is inferred or changed is noted in the result, and printed; with --system, also whether
+    the recordings obey its equations. Nothing is lost silently, and nothing is left half-written.
     """
     from misstep.formats import format_of, write_episodes
     from misstep.formats.minari import located
@@ -195,21 +203,39 @@ def convert(
         raise MisstepError(f"{out} exists already: choose another name, or add --force")
     if not target.is_folder:
         check_output_file(out, "OUT")
-    summary = Summary()
+    summary, beginnings = Summary(), _beginnings(plan)
     with progress("converting") as report:
         episodes = planned(
-            sources, plan, format=from_format, report=lambda done, total: report(done, total, "")
+            sources,
+            plan,
+            format=from_format,
+            report=lambda done, total: report(done, total, ""),
+            beginnings=beginnings,
         )
         episodes = summary.counting(losing(episodes, target, allowed=allow_loss), target)
         write_episodes(out, episodes, format_)
     if save_mapping is not None:
         save(chosen, save_mapping)
-    write_result(json, _result(summary, sources, out))
+    checked = None if beginnings is None else beginnings.check()
+    equations = {} if checked is None else checked.as_json()
+    write_result(json, {**_result(summary, sources, out), **equations})
     _print(summary, out)
+    for line in [] if checked is None else checked.lines():
+        print(line)
     return 0
 
 
-def _result(summary: Any, sources: list[Path], out: Path) -> dict[str, Any]:
+def _beginnings(plan: "Plan") -> "Beginnings | None":
+    """Return what the equations of the system are checked on; None where none is named."""
+    system = plan.make_system()
+    if system is None:
+        return None
+    from misstep.recordings.checking import Beginnings
+
+    return Beginnings(system)
+
+
+def _result(summary: "Summary", sources: list[Path], out: Path) -> dict[str, Any]:
     first = summary.first
     return {
         "in": [str(path) for path in sources],
@@ -218,14 +244,18 @@ def _result(summary: Any, sources: list[Path], out: Path) -> dict[str, Any]:
         "steps": summary.steps,
         "rates": summary.rates,
         "outcomes": summary.outcomes,
-        "observation_columns": [[c.name, c.unit] for c in first.observation_columns],
-        "action_columns": [[c.name, c.unit] for c in first.action_columns],
+        "observation_columns": _listed(first.observation_columns if first else ()),
+        "action_columns": _listed(first.action_columns if first else ()),
         "notes": summary.notes,
         "losses": summary.losses,
     }
 
 
-def _print(summary: Any, out: Path) -> None:
+def _listed(columns: "Sequence[Column]") -> list[list[str]]:
+    return [[column.name, column.unit] for column in columns]
+
+
+def _print(summary: "Summary", out: Path) -> None:
     rates = {rate for rate in summary.rates if rate is not None}
     at = f" at {rates.pop():.6g} Hz" if len(rates) == 1 and None not in summary.rates else ""
     outcomes = ", ".join(
@@ -237,6 +267,12 @@ def _print(summary: Any, out: Path) -> None:
         for line, count in lines.items():
             often = f" ({count} episodes)" if count > 1 else ""
             print(f"{kind}: {line}{often}")
+    if summary.failed_at_start:
+        print(
+            f"warning: {summary.failed_at_start} of {summary.episodes} attempts fail at their "
+            "first observation: if they begin in what --failure describes, as a pole that hangs, "
+            'say with --success and --hold what they were to reach: "abs(theta) < 12deg"'
+        )
 
 
 COMMANDS = [

@@ -50,7 +50,8 @@ def inspect(
 ) -> int:
     """Show what is in a recording, and where each attempt went wrong.
 
-    The point of no return is found with a model learned from the recording alone.
+    The point of no return is found with a model learned from the recording alone. Where the file
+    names its system, the recording is also held against the system's equations.
     """
     from misstep.formats import ReadOptions
     from misstep.inspection import inspect_file
@@ -90,6 +91,8 @@ def _print(inspection: "Inspection") -> None:
     for episode in inspection.episodes:
         for oddity in episode.oddities:
             print(f"episode {episode.number}: {oddity}")
+    for line in inspection.equations.lines():
+        print(line)
     if inspection.reason:
         print(f"where it went wrong cannot be told: {inspection.reason}")
     for sentence in inspection.sentences:

@@ -1,7 +1,7 @@
 """``misstep learn`` and ``misstep resume``: trial after trial, until one succeeds."""
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,6 +18,7 @@ from misstep.cli.options import (
     SystemName,
     parse_names,
     parse_parameters,
+    recorded_parameters,
     system_parameters,
 )
 from misstep.cli.output import (
@@ -26,11 +27,9 @@ from misstep.cli.output import (
     write_result,
 )
 from misstep.cli.progress import Report, progress
-from misstep.errors import MisstepError
-from misstep.parameters import ParameterValue
 
 if TYPE_CHECKING:
-    from misstep import Dataset, Run
+    from misstep import Run
 
 _REPRODUCTION, _STUDY = "reproduce.json", "study.json"
 
@@ -103,7 +102,7 @@ def learn(
     if learner is not None:
         misstep.LEARNERS[learner]  # an unknown name is told before anything is read
     shown = misstep.load_dataset(demonstrations)
-    driven = misstep.make_system(system, **_system_parameters(system, shown, given))
+    driven = misstep.make_system(system, **recorded_parameters(system, shown, given))
     if learner is None:
         task = Task.of(driven, parse_names(state))
         learner, why = default_learner(task, shown)
@@ -158,29 +157,6 @@ def resume(
         report(len(run.trials), run.config.max_trials, "")
         misstep.resume(run, on_trial=_reporter(report))
     return _conclude(run, json)
-
-
-def _system_parameters(
-    system: str, demonstrations: "Dataset", given: Mapping[str, ParameterValue]
-) -> dict[str, ParameterValue]:
-    """Return what was recorded with demonstrations of the same system, and over it what is given.
-
-    Raises
-    ------
-    MisstepError
-        If the demonstrations disagree on a parameter that is not given.
-    """
-    origins = [attempt.provenance for attempt in demonstrations]
-    if any(origin.system != system for origin in origins):
-        return dict(given)
-    names = sorted({name for origin in origins for name in origin.parameters} - set(given))
-    differing = [n for n in names if len({origin.parameters.get(n) for origin in origins}) > 1]
-    if differing:
-        raise MisstepError(
-            f"the demonstrations were recorded with different values of {', '.join(differing)}: "
-            "give each with --set"
-        )
-    return {**origins[0].parameters, **given}
 
 
 def _reporter(report: Report) -> Callable[["Run"], None]:

@@ -1,14 +1,17 @@
 """Options that several commands share, and how their texts are read."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from misstep.errors import MisstepError
 from misstep.parameters import ParameterValue
+
+if TYPE_CHECKING:
+    from misstep.trajectory import Dataset
 
 SystemName = Annotated[
     str, typer.Argument(metavar="SYSTEM", help="A system of `misstep list systems`.")
@@ -99,6 +102,29 @@ def system_parameters(
             raise MisstepError(f"--set {name} and --{name} are both given: choose one")
         values[name] = formula
     return values
+
+
+def recorded_parameters(
+    system: str, demonstrations: "Dataset", given: Mapping[str, ParameterValue]
+) -> dict[str, ParameterValue]:
+    """Return what was recorded with demonstrations of the same system, and over it what is given.
+
+    Raises
+    ------
+    MisstepError
+        If the demonstrations disagree on a parameter that is not given.
+    """
+    origins = [attempt.provenance for attempt in demonstrations]
+    if any(origin.system != system for origin in origins):
+        return dict(given)
+    names = sorted({name for origin in origins for name in origin.parameters} - set(given))
+    differing = [n for n in names if len({origin.parameters.get(n) for origin in origins}) > 1]
+    if differing:
+        raise MisstepError(
+            f"the demonstrations were recorded with different values of {', '.join(differing)}: "
+            "give each with --set"
+        )
+    return {**origins[0].parameters, **given}
 
 
 def parse_names(text: str | None) -> tuple[str, ...] | None:

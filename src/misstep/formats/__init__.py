@@ -1,4 +1,4 @@
-"""Files of trajectories: one module a format, chosen by the suffix of the file.
+"""Files of trajectories: one module or folder a format, chosen by the suffix of the file.
 
 A format is a `Format`, registered under a name. Another package announces its own through an
 entry point of the group ``misstep.formats``. `load_dataset` and `save_dataset` hold a data set in
@@ -12,7 +12,7 @@ from itertools import chain
 from pathlib import Path
 
 from misstep.errors import MisstepError
-from misstep.formats import csv_files, hdf5, lerobot, minari, parquet_files, robomimic, rosbag
+from misstep.formats import bags, hdf5, lerobot, minari, robomimic, tables
 from misstep.formats.format import (
     LARGEST_IN_MEMORY,
     Block,
@@ -46,17 +46,17 @@ __all__ = [
 
 FORMATS: Registry[Format] = Registry("format", "misstep.formats")
 FORMATS.register("hdf5")(hdf5.FORMAT)
-FORMATS.register("csv")(csv_files.FORMAT)
-FORMATS.register("parquet")(parquet_files.FORMAT)
+FORMATS.register("csv")(tables.CSV)
+FORMATS.register("parquet")(tables.PARQUET)
 FORMATS.register("minari")(minari.FORMAT)
 FORMATS.register("minari-arrow")(minari.ARROW)
 FORMATS.register("robomimic")(robomimic.FORMAT)
 FORMATS.register("lerobot")(lerobot.FORMAT)
 FORMATS.register("lerobot-v2.1")(lerobot.V21)
-FORMATS.register("rosbag")(rosbag.ROS1)
-FORMATS.register("rosbag2")(rosbag.ROS2)
-FORMATS.register("mcap")(rosbag.MCAP)
-FORMATS.register("db3")(rosbag.DB3)
+FORMATS.register("rosbag")(bags.ROS1)
+FORMATS.register("rosbag2")(bags.ROS2)
+FORMATS.register("mcap")(bags.MCAP)
+FORMATS.register("db3")(bags.DB3)
 
 
 def load_dataset(path: str | os.PathLike[str], format: str | None = None) -> Dataset:

@@ -27,17 +27,15 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import h5py
 import numpy as np
 
 from misstep.errors import MisstepError
 from misstep.formats.annotation import Annotation, read_annotation
-from misstep.formats.foreign_arrays import ForeignArray
 from misstep.formats.format import (
     BLOCK_ROWS,
     Block,
@@ -48,39 +46,24 @@ from misstep.formats.format import (
     ReadOptions,
 )
 from misstep.formats.guard import prefixed
-from misstep.formats.hdf5_arrays import FLOAT, RowWriter, member
-from misstep.formats.hdf5_attributes import (
+from misstep.formats.hdf5.arrays import FLOAT, RowWriter, member
+from misstep.formats.hdf5.attributes import (
     attribute,
     damage,
     has_attribute,
     json_attribute,
     set_attribute,
 )
-from misstep.formats.hdf5_texts import read_texts
+from misstep.formats.hdf5.foreign_arrays import ForeignArray
+from misstep.formats.hdf5.opening import opened
+from misstep.formats.hdf5.texts import read_texts
+from misstep.formats.hdf5.unfailing import UnfailingFile
 from misstep.formats.steps import dt_of, steps_of, uniform
-from misstep.formats.unfailing import UnfailingFile
 from misstep.storage import atomic_write
 from misstep.trajectory import Column, Outcome, Provenance
 
 _GYM = 2  # robomimic's EnvType.GYM_TYPE
 _OUTCOMES = (Outcome.SUCCESS, Outcome.FAILURE)
-
-
-@contextmanager
-def _opened(path: Path, mode: Literal["w+b", "rb"]) -> Iterator[tuple[h5py.File, UnfailingFile]]:
-    """Open a file, and in the end make sure that all of it was written."""
-    disk = UnfailingFile(path, mode)
-    try:
-        with damage("its structure"):
-            file = h5py.File(disk, "w" if mode == "w+b" else "r")
-        try:
-            yield file, disk
-        finally:
-            with damage("its structure"):
-                file.close()
-        disk.check()
-    finally:
-        disk.close()
 
 
 # Reading
@@ -89,7 +72,7 @@ def _opened(path: Path, mode: Literal["w+b", "rb"]) -> Iterator[tuple[h5py.File,
 def recognise(path: Path) -> bool:
     """Say whether a file is laid out as robomimic's are."""
     try:
-        with _opened(path, "rb") as (file, _):
+        with opened(path, "rb") as (file, _):
             return "misstep_format" not in file.attrs and bool(
                 _demos(member(file, "data", h5py.Group))
             )
@@ -108,7 +91,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Episode]:
         If the file is laid out in another way or damaged, or does not say how much time passes
         between observations and ``options.rate`` does not either.
     """
-    with _opened(path, "rb") as (file, _):
+    with opened(path, "rb") as (file, _):
         data = member(file, "data", h5py.Group)
         names = _demos(data)
         if not names:
@@ -331,7 +314,7 @@ def write(path: Path, episodes: Iterable[Episode]) -> None:
     """
 
     def fill(temporary: Path) -> None:
-        with _opened(temporary, "w+b") as (file, disk), prefixed(f"cannot write {path}"):
+        with opened(temporary, "w+b") as (file, disk), prefixed(f"cannot write {path}"):
             data = file.create_group("data")
             total = 0
             masks: dict[str, list[str]] = {outcome.value: [] for outcome in _OUTCOMES}

@@ -51,6 +51,7 @@ def _panels(columns: Sequence[Column], values: Array) -> list[tuple[list[Column]
 def _draw_signals(ax: Axes, times: Array, columns: Sequence[Column], values: Array) -> None:
     named = len(columns) <= _MOST_NAMED
     for i, column in enumerate(columns):
+        shown = _without_jumps(values[:, i], column)
         colour = SERIES[i % len(SERIES)] if len(columns) > 1 else INK
         label = column.name if named and len(columns) > 1 else None
         if len(values) < len(times):  # an action is held until the next
@@ -63,11 +64,21 @@ def _draw_signals(ax: Axes, times: Array, columns: Sequence[Column], values: Arr
                 label=label,
             )
         else:
-            ax.plot(times, values[:, i], color=colour, lw=1.3, label=label)
+            ax.plot(times, shown, color=colour, lw=1.3, label=label)
     name = columns[0].name if len(columns) == 1 else f"{len(columns)} columns"
     ax.set_ylabel(f"{name}\n[{columns[0].unit}]" if columns[0].unit else name)
     if named and len(columns) > 1:
         ax.legend(loc="upper left", ncols=len(columns))
+
+
+def _without_jumps(values: Array, column: Column) -> Array:
+    """Return values (T,) with NaN where an angle goes on at the other end of its turn."""
+    turn = {"rad": 2.0 * np.pi, "deg": 360.0}.get(column.unit)
+    if turn is None:
+        return values
+    shown = values.copy()
+    shown[1:][np.abs(np.diff(values)) > 0.5 * turn] = np.nan
+    return shown
 
 
 def _shade(ax: Axes, times: Array, blame: Array) -> None:

@@ -16,6 +16,7 @@ from misstep.errors import MisstepError
 from misstep.formats import Episode, Header, ReadOptions, read_episodes
 from misstep.formats.format import joined
 from misstep.inspection.summary import ColumnSummary, EpisodeSummary, Tally, fingerprint
+from misstep.recordings.checking import Checked, check_recorded
 from misstep.trajectory import Dataset, Trajectory
 
 Progress = Callable[[int, int], None]
@@ -39,6 +40,8 @@ class Inspection:
         One an episode; empty where nothing can be said.
     reason : str
         Why not, if so.
+    equations : Checked
+        Whether the attempts obey the equations of the system that their provenance names.
     """
 
     file: str
@@ -48,6 +51,7 @@ class Inspection:
     limits: ActionLimits | None
     blames: tuple[Blame, ...]
     reason: str
+    equations: Checked
 
     @property
     def sentences(self) -> list[str]:
@@ -72,6 +76,7 @@ class Inspection:
                 "source": self.limits.source,
             },
             "no_blame_because": self.reason,
+            **self.equations.as_json(),
         }
 
 
@@ -119,6 +124,7 @@ def inspect_file(
         limits,
         blames,
         reason,
+        Checked() if dataset is None else check_recorded(dataset),
     )
 
 

@@ -51,6 +51,7 @@ def render_inspection(inspection: Inspection, progress: Progress = lambda done, 
         inspection=inspection,
         episodes=inspection.episodes,
         columns=inspection.columns,
+        equations=inspection.equations if any(inspection.equations.lines()) else None,
         attempts=attempts,
         others=inspection.sentences[total:],
         outcomes={

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from misstep.formats.format import Block, Episode, FloatArray
+from misstep.formats.format import Block, Ending, Episode, FloatArray
 from misstep.trajectory import Column
 
 _PERIODS = {"rad": 2.0 * np.pi, "deg": 360.0}
@@ -77,16 +77,25 @@ def with_angles(episode: Episode, convention: Convention) -> Episode:
     ----------
     episode : Episode
     convention : "recorded", "wrapped" or "unwrapped"
-        As they are; within half a turn of zero; or without jumps.
+        As they are; within half a turn of zero; or without jumps. What changes is noted.
     """
     if convention == "recorded":
         return episode
     turns = Turns(episode.header.observation_columns)
     change: Callable[[FloatArray], FloatArray]
     change = turns.wrap if convention == "wrapped" else turns.unwrap
+    changed = False
 
     def blocks() -> Iterator[Block]:
+        nonlocal changed
         for block in episode.blocks:
-            yield replace(block, observations=change(block.observations))
+            observations = change(block.observations)
+            changed |= not np.array_equal(observations, block.observations)
+            yield replace(block, observations=observations)
 
-    return replace(episode, blocks=blocks())
+    def ending() -> Ending:
+        ended = episode.ending()
+        note = f"angles: {convention}, by whole turns"
+        return replace(ended, notes=(*ended.notes, note)) if changed else ended
+
+    return replace(episode, blocks=blocks(), ending=ending)

@@ -12,8 +12,8 @@ from itertools import chain
 import numpy as np
 
 from misstep.errors import MisstepError
+from misstep.formats.blocks import aligned, followed
 from misstep.formats.format import Block, Ending, Episode, FloatArray
-from misstep.formats.tables import aligned, followed
 from misstep.recordings.angles import Turns
 
 STILL_EVEN = 0.01

@@ -168,14 +168,16 @@ def infer_velocities(trajectory: Trajectory, names: Sequence[str] | None = None)
 def inferring_actions(episode: Episode, system: System) -> Episode:
     """Infer the actions of an episode on its way, see `infer_actions`; in bounded memory.
 
+    Velocities of the system that were not recorded are added, as the change of their positions.
+
     Raises
     ------
     MisstepError
         As `inverse_dynamics`, or if the rows have no common dt; some of it on the way.
     """
     dt = _even_dt(episode.header)
-    system.unwrapped.mechanics()
     columns, found = episode.header.observation_columns, _Found(system)
+    missing = _Missing.of(columns, system)
 
     def blocks() -> Iterator[Block]:
         half_width: int | None = None
@@ -185,18 +187,66 @@ def inferring_actions(episode: Episode, system: System) -> Episode:
             )
             half_width = inferred.motion.half_width
             found.add(inferred, part.own, part.start, dt)
-            yield Block(part.observations[part.own_rows], inferred.actions[part.own], part.costs)
+            whole = missing.added(part.observations, inferred.motion)
+            yield Block(whole[part.own_rows], inferred.actions[part.own], part.costs)
 
     provenance = replace(
         episode.header.provenance, system=system.system_id, parameters=system.parameters
     )
-    header = replace(episode.header, action_columns=system.action_columns, provenance=provenance)
+    header = replace(
+        episode.header,
+        observation_columns=missing.all_columns,
+        action_columns=system.action_columns,
+        provenance=provenance,
+    )
     return replace(
         episode,
         header=header,
         blocks=blocks(),
-        ending=lambda: _with_notes(episode.ending(), found.notes(dt)),
+        ending=lambda: _with_notes(episode.ending(), (*missing.notes, *found.notes(dt))),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Missing:
+    """The velocities of a system that a recording lacks.
+
+    `joints` are those whose velocity is missing, `order` where the columns of the table with them
+    at its end belong in `all_columns`: as the system has them, where they are all there.
+    """
+
+    joints: list[int]
+    order: list[int]
+    all_columns: tuple[Column, ...]
+
+    @classmethod
+    def of(cls, columns: Sequence[Column], system: System) -> "_Missing":
+        velocities = system.unwrapped.mechanics().velocities
+        recorded = {column.name for column in columns}
+        joints = [j for j, name in enumerate(velocities) if name not in recorded]
+        known = {column.name: column for column in system.observation_columns}
+        everything = [*columns, *(known[velocities[j]] for j in joints)]
+        order = list(range(len(everything)))
+        names = [column.name for column in everything]
+        if joints and set(names) == set(known):
+            order = [names.index(name) for name in known]
+        return cls(joints, order, tuple(everything[i] for i in order))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is to be noted."""
+        added = {self.order.index(len(self.order) - 1 - i) for i in range(len(self.joints))}
+        names = ", ".join(self.all_columns[i].name for i in sorted(added))
+        return (f"{names}: not recorded, the change of their positions",) if names else ()
+
+    def added(self, observations: Array, motion: Motion) -> Array:
+        """Return observations (T + 1, n) with the missing columns."""
+        if not self.joints:
+            return observations
+        middle = motion.velocities[:, self.joints]  # of each step
+        between = 0.5 * (middle[1:] + middle[:-1])
+        velocities = np.concatenate([middle[:1], between, middle[-1:]])
+        return np.concatenate([observations, velocities], axis=1)[:, self.order]
 
 
 def inferring_velocities(episode: Episode, names: Sequence[str] | None = None) -> Episode:

@@ -8,7 +8,7 @@ On the command line a column is written ::
 holds one of ``= : ,``, or its position from 0 (where it is left out: the same name, or in a file
 without names the next column). The new value is (old value · factor + offset) in ``unit``, and then
 brought to the unit without prefixes: deg to rad, cm to m, g to kg. So a dataset is in SI units,
-whatever was recorded.
+whatever was recorded. A number may be ``pi``: ``theta=2:rad:1:pi`` for an angle from the bottom.
 
 In a file the same is said in TOML ::
 
@@ -38,28 +38,7 @@ from misstep.errors import MisstepError
 from misstep.formats.format import Block, Episode, FloatArray, Header, ReadOptions
 from misstep.storage import write_text
 from misstep.trajectory import Column
-
-_DEGREE = math.pi / 180.0
-SI_UNITS: dict[str, tuple[str, float]] = {
-    "cm": ("m", 1e-2),
-    "mm": ("m", 1e-3),
-    "km": ("m", 1e3),
-    "cm/s": ("m/s", 1e-2),
-    "mm/s": ("m/s", 1e-3),
-    "km/h": ("m/s", 1 / 3.6),
-    "deg": ("rad", _DEGREE),
-    "°": ("rad", _DEGREE),
-    "deg/s": ("rad/s", _DEGREE),
-    "°/s": ("rad/s", _DEGREE),
-    "rpm": ("rad/s", math.pi / 30.0),
-    "rev": ("rad", 2.0 * math.pi),
-    "ms": ("s", 1e-3),
-    "us": ("s", 1e-6),
-    "g": ("kg", 1e-3),
-    "mN": ("N", 1e-3),
-    "kN": ("N", 1e3),
-}
-"""Units by the one they are brought to, and how many of those they are."""
+from misstep.units import UNITS
 
 _ITEM = re.compile(
     r"""\s*(?P<name>[^=:,"]+?)\s*
@@ -253,7 +232,7 @@ def _part(
             f"there is no column {source!r} for {mapped.name!r}; there are: {listed}"
         )
     unit = mapped.unit or own[index].unit
-    si, size = SI_UNITS.get(unit, (unit, 1.0))
+    si, size = UNITS.get(unit, (unit, 1.0))
     changes = [f"{unit} to {si}"] if si != unit else []
     changes += [f"times {mapped.factor:g}"] if mapped.factor != 1.0 else []
     changes += [f"plus {mapped.offset:g} {unit}".rstrip()] if mapped.offset != 0.0 else []
@@ -350,6 +329,8 @@ def _parse_item(option: str, item: str) -> MappedColumn:
 def _number(option: str, item: str, text: str | None, default: float) -> float:
     if text is None or not text.strip():
         return default
+    if text.strip().removeprefix("-") == "pi":
+        return -math.pi if text.strip().startswith("-") else math.pi
     try:
         return float(text)
     except ValueError as error:

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from misstep.errors import MisstepError
-from misstep.formats import FORMATS, format_of, load_dataset, save_dataset
+from misstep.formats import FORMATS, format_to_read, load_dataset, save_dataset
 from misstep.storage import atomic_write
 from misstep.trajectory import Dataset, Outcome, Provenance, Trajectory
 
@@ -172,12 +172,20 @@ def _number(copy: Path) -> int:
 
 
 def _load(path: str | os.PathLike[str]) -> Dataset:
-    if format_of(path) is not FORMATS["hdf5"]:
+    found = format_to_read(path)
+    if found is not FORMATS["hdf5"]:
+        kind = found.description.partition(";")[0]
         raise MisstepError(
-            f"{path} cannot hold marks: bring it into misstep's own format first, with "
-            f"`misstep convert {path} {Path(path).with_suffix('.h5')}`"
+            f"{path} is {kind}, which cannot hold marks: bring it into misstep's own format first, "
+            f"with `misstep convert {path} {_beside(Path(path))}`"
         )
-    return load_dataset(path)
+    return load_dataset(path, "hdf5")
+
+
+def _beside(path: Path) -> Path:
+    """Return a name for a file of misstep's own beside one of another format."""
+    other = path.with_suffix(".h5")
+    return other if other != path else path.with_stem(f"{path.stem}-marked")
 
 
 def _index(dataset: Dataset, episode: int) -> int:

@@ -210,6 +210,9 @@ def bridged(values: Array, column: Column, dt: float) -> tuple[Array, list[Findi
         rows = np.flatnonzero(runs == run)
         row = int(rows[np.argmax(np.abs(deviation[rows]))])
         size = float(deviation[row])
+        if _continues(values, rows, row, 0.5 * abs(size)):
+            bad[rows] = False
+            continue
         length = f"{len(rows)} samples" if len(rows) > 1 else "one sample"
         findings.append(
             Finding(
@@ -220,10 +223,26 @@ def bridged(values: Array, column: Column, dt: float) -> tuple[Array, list[Findi
                 size,
             )
         )
+    if not findings:
+        return values, []
     good = np.flatnonzero(~bad)
     mended = values.copy()
     mended[bad] = np.interp(np.flatnonzero(bad), good, values[good])
     return mended, findings
+
+
+def _continues(values: Array, rows: NDArray[np.intp], row: int, tolerance: float) -> bool:
+    """Return whether what comes before or after some rows leads straight to one of them.
+
+    So it does where a motion turns within a few rows, as it may at a low rate.
+    """
+    before, after = int(rows[0]) - 1, int(rows[-1]) + 1
+    expected = []
+    if before >= 1:
+        expected.append(values[before] + (row - before) * (values[before] - values[before - 1]))
+    if after + 1 < len(values):
+        expected.append(values[after] + (row - after) * (values[after + 1] - values[after]))
+    return any(abs(values[row] - value) < tolerance for value in expected)
 
 
 def _unwrapped(angles: Array) -> Array:

@@ -23,6 +23,7 @@ from misstep.recordings.outcomes import judged
 from misstep.recordings.resampling import at_rate
 
 if TYPE_CHECKING:
+    from misstep.recordings.checking import Beginnings
     from misstep.systems import System
 
 INVERSE_DYNAMICS, VELOCITIES = "inverse-dynamics", "velocities"
@@ -51,8 +52,9 @@ class Plan:
         Formulas for the outcome, see `misstep.judges`.
     hold : float, s
         How long a success must have held in the end.
-    angles : "recorded", "wrapped" or "unwrapped"
-        See `misstep.recordings.angles`.
+    angles : "recorded", "wrapped", "unwrapped" or None
+        See `misstep.recordings.angles`. None: wrapped, as the systems have them, where actions are
+        inferred by inverse dynamics, and else as recorded.
     only : str or None
         Name of a part of the episodes, see `misstep.formats.format.ReadOptions`.
 
@@ -71,7 +73,7 @@ class Plan:
     failure: str | None = None
     success: str | None = None
     hold: float = 0.0
-    angles: Convention = "recorded"
+    angles: Convention | None = None
     only: str | None = None
 
     def __post_init__(self) -> None:
@@ -87,7 +89,7 @@ class Plan:
                 "--infer-actions inverse-dynamics goes by the equations of a system: name it with "
                 "--system, and its parameters with --set"
             )
-        if self.angles not in ("recorded", "wrapped", "unwrapped"):
+        if self.angles not in (None, "recorded", "wrapped", "unwrapped"):
             raise MisstepError(
                 f"--angles {self.angles!r}: there are recorded, wrapped and unwrapped"
             )
@@ -106,7 +108,9 @@ class Plan:
 
         return make_system(self.system, **self.parameters)
 
-    def apply(self, episode: Episode, system: "System | None") -> Episode:
+    def apply(
+        self, episode: Episode, system: "System | None", beginnings: "Beginnings | None" = None
+    ) -> Episode:
         """Return the episode as it is to be written.
 
         Parameters
@@ -114,6 +118,8 @@ class Plan:
         episode : Episode
         system : System or None
             What `make_system` built.
+        beginnings : Beginnings, optional
+            Sees the episode at the rate that it was recorded with, in the system's units.
 
         Raises
         ------
@@ -125,9 +131,12 @@ class Plan:
         if needs_clock or self.mapping.rate is not None:
             episode = on_one_clock(episode, self.mapping.rate)
         episode = self._with_provenance(episode, system)
+        if beginnings is not None:
+            episode = beginnings.keeping(episode)
         episode = self._with_actions(episode, system)
         episode = at_rate(episode, self.to_rate)
-        episode = with_angles(episode, self.angles)
+        usual: Convention = "wrapped" if self.infer_actions == INVERSE_DYNAMICS else "recorded"
+        episode = with_angles(episode, self.angles or usual)
         episode = judged(episode, failure=self.failure, success=self.success, hold=self.hold)
         return _counted(episode)
 
@@ -157,6 +166,7 @@ def planned(
     *,
     format: str | None = None,
     report: Callable[[int, int], None] | None = None,
+    beginnings: "Beginnings | None" = None,
 ) -> Iterator[Episode]:
     """Read files and yield their episodes as a plan says.
 
@@ -168,6 +178,8 @@ def planned(
         Name of the format that the files have.
     report : callable, optional
         ``report(done, total)`` of all files together, in thousandths.
+    beginnings : Beginnings, optional
+        As `Plan.apply` takes them.
 
     Raises
     ------
@@ -184,7 +196,7 @@ def planned(
         options = replace(plan.mapping.options(), only=plan.only, report=report_one)
         for episode in read_episodes(path, options, format):
             with prefixed(str(path)):
-                yield plan.apply(episode, system)
+                yield plan.apply(episode, system, beginnings)
 
 
 def losing(episodes: Iterator[Episode], target: Format, *, allowed: bool) -> Iterator[Episode]:
@@ -254,6 +266,8 @@ class Summary:
         Each note and in how many episodes it is.
     losses : dict from str to int
         What the format cannot hold, and of how many episodes.
+    failed_at_start : int
+        Episodes that failed at their first observation.
     first : Header or None
         Of the first episode.
     """
@@ -264,6 +278,7 @@ class Summary:
     rates: list[float | None] = field(default_factory=list)
     notes: dict[str, int] = field(default_factory=dict)
     losses: dict[str, int] = field(default_factory=dict)
+    failed_at_start: int = 0
     first: Header | None = None
 
     def counting(self, episodes: Iterator[Episode], target: Format) -> Iterator[Episode]:
@@ -289,6 +304,7 @@ class Summary:
         def ending() -> Ending:
             ended = episode.ending()
             self.outcomes.append(ended.outcome.value)
+            self.failed_at_start += ended.failure_step == 0
             for note in (*header.provenance.notes, *ended.notes):
                 self.notes[note] = self.notes.get(note, 0) + 1
             return ended

@@ -14,7 +14,8 @@ from misstep.formats.annotation import Annotation
 from misstep.formats.folders import write_folder
 from misstep.formats.format import Episode, FloatArray, Header
 from misstep.formats.guard import prefixed
-from misstep.formats.lerobot_files import DONE, REWARD, SUCCESS, damage, installed, recognise
+from misstep.formats.lerobot.files import DONE, REWARD, SUCCESS, damage, recognise
+from misstep.formats.libraries import needed
 from misstep.formats.steps import dt_of, steps_of, uniform
 from misstep.trajectory import Outcome
 
@@ -39,7 +40,7 @@ def write(path: Path, episodes: Iterable[Episode], version: str = "v3.0") -> Non
         If an episode has no actions, no common dt, no whole number of rows a second, or another
         kind than the first; there is none; or the folder cannot be written.
     """
-    installed()
+    needed("pyarrow", "a data set of LeRobot's", "lerobot")
 
     def fill(folder: Path) -> None:
         writer: _Writer | None = None

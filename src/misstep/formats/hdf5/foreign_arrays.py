@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
-from misstep.formats.hdf5_arrays import member
-from misstep.formats.hdf5_attributes import damage
+from misstep.formats.hdf5.arrays import member
+from misstep.formats.hdf5.attributes import damage
 
 _LARGEST_CHUNK = 2**26  # bytes, inflated
 _LARGEST_ROW = 2**20  # bytes

@@ -1,11 +1,11 @@
 """Bags of ROS 1 and ROS 2, through rosbags, without ROS.
 
-Reading: columns are places in messages, `misstep.formats.bag_places`; observations and actions can
+Reading: columns are places in messages, `misstep.formats.bags.places`; observations and actions can
 be named with ``ReadOptions``. Unless they are, positions and velocities of
 ``sensor_msgs/JointState`` (and the poses of ``nav_msgs/Odometry`` and their kind) are the
 observations, and commands (``std_msgs/Float64``, ``geometry_msgs/Twist`` ...) the actions. Message
 types come from the bag, so those that nobody else knows will do. Messages are brought to one
-clock, `misstep.formats.bag_clock`: the times at which those of the first observation's topic were
+clock, `misstep.formats.bags.clock`: the times at which those of the first observation's topic were
 received, or a given rate.
 
 A bag is one episode, unless misstep wrote it, or ``ReadOptions.episode`` says where to cut: at
@@ -17,9 +17,9 @@ second apart. What ROS has no place for stands in messages on ``/misstep`` befor
 episode; costs on ``/misstep/cost``. Times are whole nanoseconds.
 """
 
-from misstep.formats.bag_library import recognise
-from misstep.formats.bag_reading import read
-from misstep.formats.bag_writing import write_mcap, write_ros1, write_ros2
+from misstep.formats.bags.reading import read
+from misstep.formats.bags.topics import recognise
+from misstep.formats.bags.writing import write_mcap, write_ros1, write_ros2
 from misstep.formats.format import Format
 
 ROS1 = Format("ROS 1 bag", (".bag",), read, write_ros1, extra="ros")

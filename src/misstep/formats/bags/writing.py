@@ -1,4 +1,4 @@
-"""Writing bags of ROS 1 and ROS 2; `misstep.formats.rosbag` says what goes where."""
+"""Writing bags of ROS 1 and ROS 2; `misstep.formats.bags` says what goes where."""
 
 import json
 import re
@@ -14,10 +14,11 @@ import numpy as np
 
 from misstep.errors import MisstepError
 from misstep.formats.annotation import Annotation
-from misstep.formats.bag_library import ANNOTATIONS, COST, installed, recognise
+from misstep.formats.bags.topics import ANNOTATIONS, COST, recognise
 from misstep.formats.folders import write_folder
 from misstep.formats.format import Ending, Episode, Header
 from misstep.formats.guard import prefixed
+from misstep.formats.libraries import needed
 from misstep.formats.steps import dt_of, steps_of, uniform
 from misstep.storage import atomic_write
 
@@ -201,7 +202,7 @@ def write_ros1(path: Path, episodes: Iterable[Episode]) -> None:
         If an episode has no actions, no common dt, or another kind than the first; there is none;
         or the file cannot be written.
     """
-    installed()
+    needed("rosbags.highlevel", "a bag", "ros")
     from rosbags.rosbag1 import Writer
 
     atomic_write(path, lambda temporary: _record(path, Writer(temporary), episodes, True))
@@ -237,7 +238,7 @@ def write_mcap(path: Path, episodes: Iterable[Episode]) -> None:
 
 
 def _fill_ros2(folder: Path, path: Path, episodes: Iterable[Episode], kind: str) -> None:
-    installed()
+    needed("rosbags.highlevel", "a bag", "ros")
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     writer = Writer(folder, version=8, storage_plugin=StoragePlugin[kind])

@@ -12,7 +12,7 @@ from pathlib import Path
 import h5py
 
 from misstep.errors import MisstepError
-from misstep.formats.hdf5_attributes import damage
+from misstep.formats.hdf5.attributes import damage
 
 _SECONDS = 20
 _LARGEST = 2**24  # bytes of all texts

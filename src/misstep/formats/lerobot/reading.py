@@ -25,14 +25,8 @@ from misstep.formats.format import (
     ReadOptions,
 )
 from misstep.formats.guard import prefixed
-from misstep.formats.lerobot_files import (
-    REWARD,
-    SUCCESS,
-    damage,
-    installed,
-    read_json,
-    read_lines,
-)
+from misstep.formats.lerobot.files import REWARD, SUCCESS, damage, read_lines
+from misstep.formats.libraries import needed, read_json
 from misstep.trajectory import Column, Outcome, Provenance
 
 if TYPE_CHECKING:
@@ -75,7 +69,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Episode]:
     MisstepError
         If it is of a version other than 2.x and 3.x, laid out in another way, or damaged.
     """
-    installed()
+    needed("pyarrow", "a data set of LeRobot's", "lerobot")
     info = _info(read_json(path / "meta" / "info.json"))
     files = sorted(path.glob("data/*/*.parquet"), key=_numbers_in)
     if not files:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
-from misstep.formats.hdf5_attributes import damage
+from misstep.formats.hdf5.attributes import damage
 
 FLOAT = np.dtype("<f8")
 BOOL = np.dtype(bool)

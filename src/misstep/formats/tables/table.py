@@ -1,22 +1,4 @@
-"""Tables, as CSV and Parquet hold them: a row for each observation, and what was done there.
-
-misstep writes these columns, and reads any others that it is told about:
-
-==================  ============================================================================
-column              meaning
-==================  ============================================================================
-``episode``         number of the episode; the column that changes from one to the next
-``time [s]``        time of the observation, from the start of the episode
-``x [m]``           an observation, with its unit if it has one
-``action:F [N]``    an action; empty in the last row of an episode, which leads nowhere
-``cost``            cost of the step; empty where none were recorded
-``misstep``         in the first and in the last row of an episode, what else is known of it: one
-                    line of JSON, see `misstep.formats.annotation`. With it a file holds all that
-                    misstep knows, and comes back the same to the last bit
-==================  ============================================================================
-
-Here is what both have in common: which column is what, and where one episode ends.
-"""
+"""Which column of a table is what, and where one episode ends: what CSV and Parquet share."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -28,6 +10,7 @@ import numpy as np
 
 from misstep.errors import MisstepError
 from misstep.formats.annotation import Annotation, read_annotation
+from misstep.formats.blocks import aligned
 from misstep.formats.format import Block, Ending, Episode, FloatArray, Header, ReadOptions
 from misstep.formats.guard import check_same_kind, prefixed
 from misstep.trajectory import Column, Provenance
@@ -461,52 +444,3 @@ def _times(block: Block, header: Header, row: int) -> FloatArray:
     if block.times is not None:
         return block.times
     return np.arange(row, row + len(block.observations)) * np.float64(header.dt or 0.0)
-
-
-def aligned(blocks: Iterable[Block], *, has_actions: bool) -> Iterator[Block]:
-    """Yield blocks of as many actions as observations, but for the last, with one action less.
-
-    Where there are no actions, every block has none, and the last one is a single observation.
-
-    Parameters
-    ----------
-    blocks : iterable of Block
-        Of one episode.
-    has_actions : bool
-    """
-    kept: Block | None = None
-    for block in blocks:
-        whole = block if kept is None else followed(kept, block)
-        count = len(whole.observations) - 1
-        if has_actions:
-            count = min(count, len(whole.actions))
-        if whole.costs is not None:
-            count = min(count, len(whole.costs))
-        kept = _cut(whole, slice(count, None))
-        if count > 0:
-            yield _cut(whole, slice(count))
-    if kept is not None:
-        yield kept
-
-
-def followed(a: Block, b: Block) -> Block:
-    """Return two blocks, one after the other, as one."""
-
-    def both(x: FloatArray | None, y: FloatArray | None) -> FloatArray | None:
-        return None if x is None or y is None else np.concatenate([x, y])
-
-    return Block(
-        np.concatenate([a.observations, b.observations]),
-        np.concatenate([a.actions, b.actions]),
-        both(a.costs, b.costs),
-        both(a.times, b.times),
-    )
-
-
-def _cut(block: Block, rows: slice) -> Block:
-    return Block(
-        block.observations[rows],
-        block.actions[rows],
-        None if block.costs is None else block.costs[rows],
-        None if block.times is None else block.times[rows],
-    )

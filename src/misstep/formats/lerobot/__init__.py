@@ -27,9 +27,9 @@ has no place for stands in ``meta/misstep.jsonl``, a line for each episode.
 from functools import partial
 
 from misstep.formats.format import Format, Header
-from misstep.formats.lerobot_files import recognise
-from misstep.formats.lerobot_reading import read
-from misstep.formats.lerobot_writing import write
+from misstep.formats.lerobot.files import recognise
+from misstep.formats.lerobot.reading import read
+from misstep.formats.lerobot.writing import write
 
 
 def losses(header: Header) -> tuple[str, ...]:

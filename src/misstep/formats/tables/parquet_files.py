@@ -9,7 +9,8 @@ import numpy as np
 from misstep.errors import MisstepError
 from misstep.formats.format import BLOCK_ROWS, Episode, FloatArray, Format, ReadOptions
 from misstep.formats.guard import prefixed
-from misstep.formats.tables import (
+from misstep.formats.libraries import needed
+from misstep.formats.tables.table import (
     ANNOTATION,
     EPISODE,
     Keys,
@@ -25,13 +26,9 @@ _GROUP_ROWS = 2**16  # of a row group
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
-def _pyarrow() -> Any:
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise MisstepError("Parquet needs pyarrow: install misstep[parquet]") from error
-    return pyarrow
+def _arrow() -> Any:
+    needed("pyarrow.parquet", "Parquet", "parquet")
+    return needed("pyarrow", "Parquet", "parquet")
 
 
 def read(path: Path, options: ReadOptions) -> Iterator[Episode]:
@@ -42,7 +39,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Episode]:
     MisstepError
         Also on the way: if the file is damaged, or a column that is needed holds no numbers.
     """
-    arrow = _pyarrow()
+    arrow = _arrow()
     if not path.is_file():
         raise MisstepError("it is a folder or a device; name a file")
     try:
@@ -62,7 +59,7 @@ class _RowReader:
         self.cells: list[str] = list(file.schema_arrow.names)
 
     def rows(self, numbers: Sequence[int], key: int | None, text: int | None) -> Iterator[Rows]:
-        """Yield rows of some columns, see `misstep.formats.tables.Table`."""
+        """Yield rows of some columns, see `misstep.formats.tables.table.Table`."""
         wanted = {self.cells[i] for i in (*numbers, key, text) if i is not None}
         row, total = 0, self._file.metadata.num_rows
         batches = self._file.iter_batches(
@@ -115,7 +112,7 @@ def write(path: Path, episodes: Iterable[Episode]) -> None:
     MisstepError
         If the episodes differ in their columns, there is none, or the file cannot be written.
     """
-    arrow = _pyarrow()
+    arrow = _arrow()
 
     def fill(temporary: Path) -> None:
         writer = None

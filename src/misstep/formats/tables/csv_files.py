@@ -21,7 +21,7 @@ import numpy as np
 from misstep.errors import MisstepError
 from misstep.formats.format import Episode, FloatArray, Format, ReadOptions
 from misstep.formats.guard import prefixed
-from misstep.formats.tables import (
+from misstep.formats.tables.table import (
     EPISODE,
     TIME,
     Keys,
@@ -167,7 +167,7 @@ class _RowReader:
         self._keys = Keys()
 
     def rows(self, numbers: Sequence[int], key: int | None, text: int | None) -> Iterator[Rows]:
-        """Yield rows of some columns, see `misstep.formats.tables.Table`."""
+        """Yield rows of some columns, see `misstep.formats.tables.table.Table`."""
         ended_at: int | None = None
         for number, lines in self._lines.pieces():
             filled = len(lines)
