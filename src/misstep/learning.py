@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from misstep.errors import MisstepError
-from misstep.learners import Evidence, Task, default_learner
+from misstep.learners import Evidence, LearnedPolicy, Task, default_learner
 from misstep.parameters import ParameterValue
 from misstep.rollout import Policy, rollout
 from misstep.runs import Run, RunConfig
@@ -80,6 +80,32 @@ def learn(
     The outer loop of the paper's listing (section IV). Its inner loop ends when an action is zero;
     a pendulum's force passes through zero on the way, so a trial here ends when the system says so.
     """
+    run = begin(
+        system,
+        demonstrations,
+        learner,
+        state=state,
+        max_trials=max_trials,
+        seed=seed,
+        stop_on_success=stop_on_success,
+        **learner_parameters,
+    )
+    with kept_in(run, out):
+        return resume(run, system=system, on_trial=on_trial)
+
+
+def begin(
+    system: System,
+    demonstrations: Dataset,
+    learner: str | None = None,
+    *,
+    state: Sequence[str] | None = None,
+    max_trials: int = 20,
+    seed: int = 0,
+    stop_on_success: bool = True,
+    **learner_parameters: ParameterValue,
+) -> Run:
+    """Return a run without a trial yet; parameters and errors are those of `learn`."""
     if max_trials < 1:
         raise MisstepError(f"max_trials is {max_trials}: at least one trial is needed")
     if seed < 0:
@@ -99,9 +125,7 @@ def learn(
     )
     config.make_learner()
     _check_fit(system, demonstrations)
-    run = Run(config, demonstrations)
-    with _nothing_half_made(run, out):
-        return resume(run, system=system, on_trial=on_trial)
+    return Run(config, demonstrations)
 
 
 def resume(run: Run, *, system: System | None = None, on_trial: OnTrial | None = None) -> Run:
@@ -117,27 +141,77 @@ def resume(run: Run, *, system: System | None = None, on_trial: OnTrial | None =
         Called with the run after each trial.
     """
     system = run.config.make_system() if system is None else system
-    learner = run.config.make_learner()
-    task = Task.of(system, run.config.state).seen_from(learner.rung)
+    task = Task.of(system, run.config.state)
     while not run.finished:
-        stream = np.random.SeedSequence(run.config.seed, spawn_key=(len(run.trials),))
-        learning, acting = stream.spawn(2)
-        started = time.perf_counter()
-        evidence = Evidence.seen_from(
-            learner.rung, run.demonstrations, run.trials, run.policies, run.config.seed
-        )
-        policy = learner.policy(task, evidence, np.random.default_rng(learning))
-        seconds = time.perf_counter() - started
+        proposal = propose(run, task)
         trial = rollout(
-            system,
-            policy,
-            seed=int(acting.generate_state(1)[0]),
-            demonstrator=f"learner:{run.config.learner}",
+            system, proposal.policy, seed=proposal.seed, demonstrator=proposal.demonstrator
         )
-        run.add(policy, trial, seconds)
+        run.add(proposal.policy, trial, proposal.seconds)
         if on_trial is not None:
             on_trial(run)
     return run
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """What to try next, by whomever it is tried."""
+
+    policy: LearnedPolicy
+    seed: int
+    """Of the trial's start."""
+    demonstrator: str
+    """For the trial's provenance."""
+    seconds: float
+    """Wall-clock time that the policy took to learn, s."""
+
+
+def propose(run: Run, task: Task) -> Proposal:
+    """Learn the policy of the next trial from everything that a run has tried.
+
+    It depends on nothing but the run as it stands: whoever tries it and adds the trial, here or on
+    a robot, gets the same next proposal.
+
+    Parameters
+    ----------
+    run : Run
+        Left as it is.
+    task : Task
+        Of the run's system and state.
+
+    Raises
+    ------
+    MisstepError
+        If there is nothing that the learner can learn from.
+    """
+    learner = run.config.make_learner()
+    stream = np.random.SeedSequence(run.config.seed, spawn_key=(len(run.trials),))
+    learning, acting = stream.spawn(2)
+    started = time.perf_counter()
+    evidence = Evidence.seen_from(
+        learner.rung, run.demonstrations, run.trials, run.policies, run.config.seed
+    )
+    policy = learner.policy(task.seen_from(learner.rung), evidence, np.random.default_rng(learning))
+    return Proposal(
+        policy,
+        seed=int(acting.generate_state(1)[0]),
+        demonstrator=f"learner:{run.config.learner}",
+        seconds=time.perf_counter() - started,
+    )
+
+
+@contextmanager
+def kept_in(run: Run, out: str | os.PathLike[str] | None) -> Iterator[None]:
+    """Keep the run in `out`, and take a new folder away again if there is no first trial."""
+    is_new = out is not None and not Path(out).exists()
+    if out is not None:
+        run.keep_in(out)
+    try:
+        yield
+    except MisstepError:
+        if is_new and run.folder is not None and not run.trials:
+            shutil.rmtree(run.folder)
+        raise
 
 
 @dataclass(frozen=True)
@@ -196,20 +270,6 @@ def wilson_interval(successes: int, n: int) -> tuple[float, float]:
     centre = (rate + z2 / (2 * n)) / (1 + z2 / n)
     half = _Z_95 / (1 + z2 / n) * math.sqrt(rate * (1 - rate) / n + z2 / (4 * n * n))
     return max(0.0, centre - half), min(1.0, centre + half)
-
-
-@contextmanager
-def _nothing_half_made(run: Run, out: str | os.PathLike[str] | None) -> Iterator[None]:
-    """Keep the run in `out`, and take a new folder away again if there is no first trial."""
-    is_new = out is not None and not Path(out).exists()
-    if out is not None:
-        run.keep_in(out)
-    try:
-        yield
-    except MisstepError:
-        if is_new and run.folder is not None and not run.trials:
-            shutil.rmtree(run.folder)
-        raise
 
 
 def _listing(columns: Sequence[Column]) -> str:

@@ -29,6 +29,8 @@ from misstep.cli import (
     mark,
     record,
     reproduce,
+    robot,
+    serve,
     study,
 )
 from misstep.errors import MisstepError
@@ -75,6 +77,8 @@ def misstep(
 for _module in (
     record,
     learn,
+    serve,
+    robot,
     evaluate,
     inspect,
     mark,

@@ -1,0 +1,1 @@
+"""Trials on a robot: the exploration service, what keeps it safe, and ways to reach it."""
