@@ -7,6 +7,9 @@
     interruption.py   what to do after a Ctrl-C
     record.py         demonstrate
     learn.py          learn, resume
+    live.py           live
+    serve.py          serve, explain
+    robot.py          drive, offer
     evaluate.py       evaluate
     inspect.py        inspect
     mark.py           mark

@@ -26,6 +26,7 @@ from misstep.cli import (
     evaluate,
     inspect,
     learn,
+    live,
     mark,
     record,
     reproduce,
@@ -77,6 +78,7 @@ def misstep(
 for _module in (
     record,
     learn,
+    live,
     serve,
     robot,
     evaluate,

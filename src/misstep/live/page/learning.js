@@ -1,0 +1,102 @@
+// The panel of learning: which learner, its options, and the plain sentences.
+
+import { byId, h, nameOf, setText, shownUnit, signed } from "misstep/dom.js";
+
+const RUNGS = [
+  "Rung 0 · is told nothing more",
+  "Rung 1 · is told whether an attempt succeeded",
+  "Rung 2 · is told when it went wrong",
+  "Rung 3 · is told what each step cost",
+  "Rung 4 · is told the cost, and learns how the system responds",
+];
+
+export class LearningPanel {
+  constructor(send) {
+    this.send = send;
+    this.spoken = 0;
+    byId("learner").addEventListener("change", () => this.explain());
+  }
+
+  hello(learners) {
+    this.learners = learners;
+    const select = byId("learner"), chosen = select.value;
+    select.replaceChildren(...RUNGS.map((title, rung) => h("optgroup", { label: title },
+      ...learners.filter((one) => one.rung === rung).map((one) => h("option", { value: one.name }, `${one.name} · rung ${one.rung}`)))));
+    this.prefer(chosen);
+  }
+
+  prefer(name) {
+    if (this.learners?.some((one) => one.name === name)) byId("learner").value = name;
+    this.explain();
+  }
+
+  get learner() { return this.learners?.find((one) => one.name === byId("learner").value); }
+
+  explain() {
+    const one = this.learner;
+    if (one) setText(byId("learner-says"), `${one.sentence} It is told ${one.told}.`);
+    this.update?.();
+  }
+
+  // Columns, number of trials, seed, and the runs that are kept; rebuilt only when they change.
+  options(session) {
+    const told = JSON.stringify([session.system.name, session.runs, session.mode === "learning"]);
+    if (told === this.before) return;
+    const same = this.system === session.system.name;
+    const unchecked = same ? [...document.querySelectorAll("#columns input:not(:checked)")].map((box) => box.value) : [];
+    const trials = same ? byId("max-trials").value : 20, seed = same ? byId("seed").value : 0;
+    this.before = told;
+    this.system = session.system.name;
+    const columns = session.system.columns.map((column) => h("label", {},
+      h("input", { type: "checkbox", value: column.name, checked: !unchecked.includes(column.name) }),
+      `${nameOf(column)} (${column.name})`));
+    const runs = session.runs.map((name) => h("div", { className: "row" },
+      h("code", { className: "grow" }, name),
+      h("button", { onclick: () => this.ask("open_run", name) }, "Open"),
+      h("button", { onclick: () => this.ask("resume_run", name) }, "Go on")));
+    byId("more-sheet").replaceChildren(
+      h("h3", {}, "What the policy may see"), h("div", { id: "columns" }, ...columns),
+      h("h3", {}, "Trials"),
+      h("div", { className: "row" },
+        h("label", {}, "at most", h("input", { id: "max-trials", type: "number", min: 1, max: 200, value: trials })),
+        h("label", {}, "seed", h("input", { id: "seed", type: "number", min: 0, max: 2147483647, value: seed }))),
+      h("h3", {}, "Earlier runs"), ...(runs.length ? runs : [h("p", { className: "faint" }, "None yet.")]));
+  }
+
+  ask(kind, name) {
+    byId("more").open = false;
+    this.send({ t: kind, name });
+  }
+
+  learn() {
+    const bounded = (id, low, high) => Math.min(high, Math.max(low, Math.round(Number(byId(id).value)) || low));
+    this.send({
+      t: "learn",
+      learner: byId("learner").value,
+      state: [...document.querySelectorAll("#columns input:checked")].map((box) => box.value),
+      max_trials: bounded("max-trials", 1, 200),
+      seed: bounded("seed", 0, 2147483647),
+    });
+  }
+
+  // What is going on in this very state, at most four times a second, so that it can be read.
+  here(now, conditional, action, system) {
+    if (now - this.spoken < 250) return;
+    this.spoken = now;
+    setText(byId("here"), conditional ? sentenceHere(conditional, action, system) : "");
+  }
+}
+
+export function sentenceHere(conditional, action, system) {
+  const column = system.actions[0], unit = shownUnit(column);
+  const said = (value) => `${signed(value)} ${unit}`.trim();
+  if (conditional.isFar) return `Nobody has been near this state before; it does ${said(action)}.`;
+  const epsilon = `(ε ${conditional.epsilon.toFixed(2)})`;
+  const off = Math.abs(action - conditional.mean) / (conditional.deviation || 1);
+  const usual = said(conditional.mean), does = said(action);
+  if (conditional.epsilon < 0.35) {
+    return `Here they agree ${epsilon} on ${usual}: ${off < 1 ? `${does} repeats it` : `yet it does ${does}`}.`;
+  }
+  const how = off < 0.35 ? "near the middle" : off < 1.2 ? "to one side of it" : "well away from it";
+  return `Here they disagree ${epsilon}, ${usual} on average: ${does} is ${how}.`;
+}
