@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 OUT ?= out/paper
 
-.PHONY: demo test check format clean
+.PHONY: demo test check format gazebo clean
 
 demo: $(READY)  ## The paper, from five sets of failed demonstrations; ends with the report's path.
 	$(BIN)/misstep reproduce --quick --out $(OUT)
@@ -30,6 +30,9 @@ $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@touch $(READY)
+
+gazebo: $(READY)  ## The bridge to Gazebo's physics, for the system cartpole-gazebo.
+	$(BIN)/python -m misstep.robot.gazebo.build
 
 clean:  ## Remove the environment and all outputs.
 	rm -rf $(VENV) out .mypy_cache .pytest_cache .ruff_cache .hypothesis

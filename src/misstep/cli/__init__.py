@@ -10,6 +10,7 @@
     live.py           live
     serve.py          serve, explain
     robot.py          drive, offer
+    ros.py            ros1, ros2
     evaluate.py       evaluate
     inspect.py        inspect
     mark.py           mark

@@ -31,6 +31,7 @@ from misstep.cli import (
     record,
     reproduce,
     robot,
+    ros,
     serve,
     study,
 )
@@ -92,6 +93,12 @@ for _module in (
 ):
     for _name, _command, _example in _module.COMMANDS:
         app.command(_name, epilog=_EXAMPLE.format(_example))(_command)
+
+for _group, _help, _members in ros.GROUPS:
+    _commands = typer.Typer(cls=_Commands, add_completion=False, rich_markup_mode=None, help=_help)
+    for _name, _command, _example in _members:
+        _commands.command(_name, epilog=_EXAMPLE.format(_example))(_command)
+    app.add_typer(_commands, name=_group)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

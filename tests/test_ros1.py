@@ -1,0 +1,227 @@
+"""ROS 1 for real: a roscore, nodes in processes of their own, topics, services, bags."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ros_graphs import ROOT, Graph, ended, missing, until, untimed
+
+import misstep
+from misstep.paper.calibration import FIRST
+from misstep.paper.experiments import PAPER_DONUT
+from misstep.robot.log import Event, Sent, read_log
+from misstep.runs import load_run
+
+pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
+
+JOINT_STATES = "/joint_states"
+
+
+@pytest.fixture(scope="module")
+def graph(tmp_path_factory):
+    graph = Graph(tmp_path_factory.mktemp("ros"))
+    yield graph
+    graph.close()
+
+
+def options(parameters):
+    return [word for name, value in parameters.items() for word in ("--set", f"{name}={value}")]
+
+
+def test_the_papers_experiment_runs_through_the_middleware_as_without_it(graph, tmp_path):
+    duration, trials = 6.0, 11
+    launched = graph.start(
+        "roslaunch", "misstep_ros", "experiment.launch", f"out:={tmp_path}", f"duration:={duration}"
+    )
+    own = misstep.make_system("cartpole", **{**FIRST.system, "duration": duration})
+    shown = misstep.demonstrate(own, "noisy", n=4, seed=0, **FIRST.demonstrator)
+    expected = misstep.learn(
+        own,
+        shown,
+        "donut",
+        state=("theta",),
+        max_trials=trials,
+        seed=0,
+        stop_on_success=False,
+        **PAPER_DONUT,
+    )
+    assert launched.wait(120.0) == 0, launched.said()
+    demonstrations = misstep.load_dataset(tmp_path / "demonstrations.h5")
+    run = load_run(tmp_path / "run")
+    assert untimed(demonstrations) == untimed(shown)
+    assert run.finished
+    assert len(run.trials) == trials
+    assert untimed(run.trials) == untimed(expected.trials)
+    for ours, theirs in zip(run.policies, expected.policies, strict=True):
+        arrays, others = ours.arrays(), theirs.arrays()
+        assert all(np.array_equal(arrays[name], others[name]) for name in others)
+    check_bag(sorted((tmp_path / "bags").glob("*.bag"))[-1], run.trials[-1])
+
+
+def check_bag(path, trial):
+    """A bag, read without ROS, holds what the trial holds."""
+    from rosbags.highlevel import AnyReader
+
+    positions, efforts = [], []
+    with AnyReader([path]) as reader:
+        for connection, _, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            if connection.topic == "joint_states":
+                positions.append(message.position)
+            else:
+                efforts.append(message.data)
+    every = round(trial.dt / 0.01)
+    states = np.array(positions)[: len(trial.actions) * every + 1 : every]
+    assert np.array_equal(states, trial.observations[:, [0, 2]])
+    assert np.array_equal(
+        np.array(efforts)[: len(trial.actions) * every : every], trial.actions[:, 0]
+    )
+    assert efforts[-1] == 0.0
+
+
+def test_nothing_is_lost_when_roscore_is_killed_and_started_again(graph, tmp_path):
+    own = misstep.make_system("cartpole", duration=20.0, stop_at_fall=False)
+    settings = {"state": ("theta", "theta_dot"), "max_trials": 6, "seed": 3}
+    shown = misstep.demonstrate(own, "weak", n=2, seed=1)
+    expected = misstep.learn(own, shown, "donut", stop_on_success=False, **settings)
+    misstep.save_dataset(shown, tmp_path / "shown.h5")
+    plant = options({"duration": 20.0, "stop_at_fall": "false"})
+    simulation = graph.node("simulate", "cartpole", *plant, "--lock-step")
+    exploration = graph.node(
+        "explore",
+        *(tmp_path / "run", "--from", tmp_path / "shown.h5", *plant, "--learner", "donut"),
+        *("--state", "theta,theta_dot", "--max-trials", 6, "--seed", 3, "--keep-going"),
+        *("--lock-step", "--json", tmp_path / "result.json"),
+    )
+    controller = graph.node("control", "cartpole", *plant, "--lock-step")
+    until(lambda: list(tmp_path.glob("run/trials/*")), "the first trial")
+    master = graph.master_pid()
+    graph.kill(graph.core)
+    graph.start_core()
+    assert graph.master_pid() != master
+    assert len(trials(tmp_path / "run")) < 6  # while the trials went on
+    for node in (controller, exploration):
+        ended(node)
+    graph.stop(simulation)
+    assert untimed(load_run(tmp_path / "run").trials) == untimed(expected.trials)
+    assert json.loads((tmp_path / "result.json").read_text())["trials"] == 6
+
+
+WATCH = """
+import sys
+from misstep.robot.ros1.environment import import_ros, init_node
+rospy = init_node("watcher")
+kind = import_ros("sensor_msgs.msg").JointState
+rospy.Subscriber(sys.argv[1], kind, lambda m: print(m.effort[0], flush=True))
+rospy.spin()
+"""
+
+
+class Watcher:
+    """Sees which effort acts on the robot."""
+
+    def __init__(self, graph):
+        self.process = graph.start(sys.executable, "-c", WATCH, JOINT_STATES, name="watch")
+
+    def efforts(self):
+        return [float(line) for line in self.process.said().splitlines()]
+
+    def rests(self):
+        """Whether the last 100 ms saw no effort."""
+        return not any(self.efforts()[-20:])
+
+    def moves(self):
+        """Whether every state of the last 50 ms saw an effort."""
+        efforts = self.efforts()[-10:]
+        return len(efforts) == 10 and all(efforts)
+
+
+def trials(folder):
+    return sorted(folder.glob("trials/*.h5"))
+
+
+def test_whoever_is_killed_the_actuator_ends_safe_and_the_trials_are_kept(graph, tmp_path):
+    """By the clock: controller killed, exploration node killed, emergency stop."""
+    plant = options({"physics_step": 0.005, "duration": 1.5, "stop_at_fall": "false"})
+    own = misstep.make_system("cartpole", physics_step=0.005, duration=1.5, stop_at_fall=False)
+    misstep.save_dataset(misstep.demonstrate(own, "weak", n=2, seed=1), tmp_path / "shown.h5")
+    folder = tmp_path / "run"
+    simulation = graph.node("simulate", "cartpole", *plant, "--watchdog-ms", 5000)
+    exploration = graph.node(
+        "explore",
+        *(folder, "--from", tmp_path / "shown.h5", *plant, "--learner", "mean"),
+        *("--max-trials", 3, "--keep-going", "--watchdog-ms", 500),
+    )
+    watcher = Watcher(graph)
+    controller = graph.node("control", "cartpole", *plant)
+    until(lambda: trials(folder) and watcher.moves(), "the second trial")
+    graph.kill(controller)
+    until(watcher.rests, "a robot at rest")  # long before the actuator's own watchdog
+    kept = {path: path.read_bytes() for path in trials(folder)}
+
+    controller = graph.node("control", "cartpole", *plant)
+    until(watcher.moves, "the robot to move again")
+    graph.kill(exploration)
+    until(watcher.rests, "a robot at rest")
+    exploration = graph.node("explore", folder, "--watchdog-ms", 500)
+    until(watcher.moves, "the robot to move again")
+    stopped = graph.call("rosservice", "call", "/exploration/stop")
+    assert "success: True" in stopped
+    until(watcher.rests, "a robot at rest")
+    graph.call("rosservice", "call", "/exploration/clear")
+    for node in (controller, exploration):
+        ended(node)
+    graph.stop(simulation)
+    graph.kill(watcher.process)
+    assert len(load_run(folder).trials) == 3
+    assert all(path.read_bytes() == data for path, data in kept.items())
+    assert all(abs(record.action[0]) <= 20.0 for record in records(folder))
+    said = [event.text for event in records(folder, Event)]
+    assert any(text.startswith("emergency stop by /rosservice") for text in said)
+    assert any("watchdog" in text for text in said)
+
+
+def records(folder, kind=Sent):
+    logs = sorted(folder.glob("actions/*.log"))
+    return [record for log in logs for record in read_log(log)[1] if isinstance(record, kind)]
+
+
+def test_debians_generator_makes_the_same_services(tmp_path):
+    """`gensrv_py.py` and the classes made at run time agree, to the checksum."""
+    source = ROOT / "ros" / "misstep_ros" / "srv"
+    names = sorted(path.stem for path in source.glob("*.srv"))
+    generator = Path("/usr/lib/genpy/gensrv_py.py")
+    python = "/usr/bin/python3"
+    files = [str(source / f"{name}.srv") for name in names]
+    subprocess.run(
+        [python, str(generator), "-p", "misstep_ros", "-o", str(tmp_path), *files], check=True
+    )
+    program = (
+        "import sys; from misstep.robot.ros1.services import service_type\n"
+        f"for name in {names}: print(name, service_type(name)._md5sum)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    for line in done.stdout.splitlines():
+        name, checksum = line.split()
+        assert f'"{checksum}"' in (tmp_path / f"_{name}.py").read_text().replace("'", '"')
+    assert names == ["Connect", "Explore", "Mark", "Reset", "Start"]
+
+
+def test_without_a_roscore_there_is_one_line(tmp_path):
+    environment = {"ROS_MASTER_URI": "http://127.0.0.1:1", "ROS_HOME": str(tmp_path), "PATH": ""}
+    program = "import sys; from misstep.cli import main; sys.exit(main())"
+    done = subprocess.run(
+        [sys.executable, "-c", program, "ros1", "simulate"],
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == [
+        "misstep: error: no roscore answers at http://127.0.0.1:1: start one, or set ROS_MASTER_URI"
+    ]
