@@ -20,7 +20,13 @@ from misstep.live.downloads import upload_suffix
 from misstep.live.guard import Guard, is_local_name
 from misstep.live.hand import Hand
 from misstep.live.narration import tell_end, tell_trial
-from misstep.live.picture import rounded, show_mixture, show_recording, show_system
+from misstep.live.picture import (
+    rounded,
+    show_mixture,
+    show_recording,
+    show_system,
+    suggested_state,
+)
 from misstep.live.protocol import KINDS, LONGEST_MESSAGE, Allowance, NotOursError, parse
 from misstep.live.replay import MODULES, PAGE, replay_html
 from misstep.mixture import GaussianMixture
@@ -340,6 +346,13 @@ def test_the_mixture_that_is_shown_conditions_as_the_one_that_was_fitted(cartpol
 def test_a_column_that_never_varies_shows_no_mixture(cartpole, demonstrations):
     still = replace(demonstrations[0], actions=np.zeros_like(demonstrations[0].actions))
     assert show_mixture(Task.of(cartpole), (still,), None, np.random.default_rng(0)) is None
+
+
+def test_the_cart_is_left_out_only_where_no_end_of_the_rail_is_in_reach():
+    assert suggested_state(make_system("cartpole")) == ["theta", "theta_dot"]
+    for name in ("cartpole-rail", "cartpole-swingup", "basket"):
+        system = make_system(name)
+        assert suggested_state(system) == [c.name for c in system.observation_columns]
 
 
 def test_the_sentences_say_which_way_it_fell(cartpole, demonstrations):

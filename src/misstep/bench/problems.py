@@ -30,12 +30,16 @@ def draw_samples(n: int, d: int, seed: int = 0) -> Array:
 
 
 def draw_start(X: Array, K: int, seed: int = 0) -> Mixture:
-    """Return a start: equal weights, samples drawn at random, the data's covariance over K."""
+    """Return a start: the data in K slices of equal size across a random direction.
+
+    Weights are equal, means are the slices', every covariance is that of all data. From samples
+    drawn at random a component may shrink onto its neighbours and become singular, in 14 columns.
+    """
     rng = np.random.default_rng([seed, K])
-    chosen = rng.choice(len(X), size=K, replace=False)
     d = X.shape[1]
-    covariances = np.repeat(np.cov(X.T).reshape(1, d, d) / K, K, axis=0)
-    return np.full(K, 1.0 / K), X[chosen], covariances
+    slices = np.array_split(np.argsort(X @ rng.normal(size=d)), K)
+    covariances = np.repeat(np.cov(X.T).reshape(1, d, d), K, axis=0)
+    return np.full(K, 1.0 / K), np.array([X[rows].mean(axis=0) for rows in slices]), covariances
 
 
 class StatePath(NamedTuple):

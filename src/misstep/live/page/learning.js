@@ -34,8 +34,22 @@ export class LearningPanel {
 
   explain() {
     const one = this.learner;
-    if (one) setText(byId("learner-says"), `${one.sentence} It is told ${one.told}.`);
+    this.suggest();
+    if (one) setText(byId("learner-says"), `${one.sentence} It is told ${one.told}${this.sees()}.`);
     this.update?.();
+  }
+
+  // Which columns the policy may see, unless somebody has chosen: all where the dynamics are learned.
+  suggest() {
+    if (!this.suggested || this.touched) return;
+    const all = this.learner?.rung >= 4;
+    for (const box of document.querySelectorAll("#columns input")) box.checked = all || this.suggested.includes(box.value);
+  }
+
+  sees() {
+    const boxes = [...document.querySelectorAll("#columns input")], chosen = boxes.filter((box) => box.checked);
+    if (!chosen.length || chosen.length === boxes.length) return "";
+    return `, and sees ${chosen.map((box) => box.dataset.name).join(" and ")} alone`;
   }
 
   // Columns, number of trials, seed, and the runs that are kept; rebuilt only when they change.
@@ -43,12 +57,15 @@ export class LearningPanel {
     const told = JSON.stringify([session.system.name, session.runs, session.mode === "learning"]);
     if (told === this.before) return;
     const same = this.system === session.system.name;
-    const unchecked = same ? [...document.querySelectorAll("#columns input:not(:checked)")].map((box) => box.value) : [];
+    const chosen = [...document.querySelectorAll("#columns input:checked")].map((box) => box.value);
+    if (!same) this.touched = false;
+    this.suggested = session.system.suggested;
     const trials = same ? byId("max-trials").value : 20, seed = same ? byId("seed").value : 0;
     this.before = told;
     this.system = session.system.name;
     const columns = session.system.columns.map((column) => h("label", {},
-      h("input", { type: "checkbox", value: column.name, checked: !unchecked.includes(column.name) }),
+      h("input", { type: "checkbox", value: column.name, checked: chosen.includes(column.name),
+        "data-name": nameOf(column), onchange: () => { this.touched = true; this.explain(); } }),
       `${nameOf(column)} (${column.name})`));
     const runs = session.runs.map((name) => h("div", { className: "row" },
       h("code", { className: "grow" }, name),
@@ -61,6 +78,7 @@ export class LearningPanel {
         h("label", {}, "at most", h("input", { id: "max-trials", type: "number", min: 1, max: 200, value: trials })),
         h("label", {}, "seed", h("input", { id: "seed", type: "number", min: 0, max: 2147483647, value: seed }))),
       h("h3", {}, "Earlier runs"), ...(runs.length ? runs : [h("p", { className: "faint" }, "None yet.")]));
+    this.explain();
   }
 
   ask(kind, name) {
