@@ -1,4 +1,5 @@
 import os
+import signal
 from contextlib import contextmanager
 
 import numpy as np
@@ -10,6 +11,11 @@ from misstep import MisstepError, demonstrate, make_system
 settings.register_profile("default", deadline=None, derandomize=True, max_examples=100)
 settings.register_profile("nightly", deadline=None, max_examples=2000)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
+
+# A shell that runs the tests in the background has interrupts ignored, and so would every program
+# that is started here and interrupted to see what it does.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")

@@ -11,11 +11,8 @@ from misstep.errors import MisstepError
 from misstep.storage import atomic_write, write_json, write_text
 
 SLOW_WRITER = """
-import signal, sys
+import sys
 from misstep.storage import atomic_write
-
-# A shell that runs the tests in the background has this ignored.
-signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def write(temporary):
     with open(temporary, "w") as file:
