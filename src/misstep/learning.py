@@ -20,7 +20,7 @@ from misstep.parameters import ParameterValue
 from misstep.rollout import Policy, rollout
 from misstep.runs import Run, RunConfig
 from misstep.systems import System
-from misstep.trajectory import Column, Dataset, Outcome
+from misstep.trajectory import Dataset, Outcome, column_listing
 
 _Z_95 = 1.959963984540054
 
@@ -272,17 +272,13 @@ def wilson_interval(successes: int, n: int) -> tuple[float, float]:
     return max(0.0, centre - half), min(1.0, centre + half)
 
 
-def _listing(columns: Sequence[Column]) -> str:
-    return ", ".join(f"{column.name} [{column.unit}]" for column in columns)
-
-
 def _check_fit(system: System, demonstrations: Dataset) -> None:
     for kind in ("observation_columns", "action_columns"):
         shown, driven = getattr(demonstrations, kind), getattr(system, kind)
         if shown != driven:
             raise MisstepError(
                 f"the demonstrations have the {kind.replace('_', ' ')} "
-                f"{_listing(shown)}, but {system.system_id} has {_listing(driven)}"
+                f"{column_listing(shown)}, but {system.system_id} has {column_listing(driven)}"
             )
     if not math.isclose(demonstrations.dt, system.dt, rel_tol=1e-9):
         raise MisstepError(

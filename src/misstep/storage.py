@@ -9,7 +9,8 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from misstep.errors import MisstepError
@@ -38,23 +39,18 @@ def atomic_write(path: str | os.PathLike[str], write: Callable[[Path], object]) 
     target = Path(os.path.realpath(path))
     if target.is_dir():
         raise MisstepError(f"cannot write {path}: it is a folder; name a file")
-    try:
+    with refusals_told(path):
         folder = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent))
         try:
             temporary = folder / target.name
             write(temporary)
             if target.exists():
                 shutil.copymode(target, temporary)
-            _flush(temporary)
+            flush(temporary)
             temporary.replace(target)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
-        _flush(target.parent)
-    except OSError as error:
-        reason = " ".join(str(error.strerror or error).split())
-        raise MisstepError(
-            f"cannot write {path}: {reason}; choose a folder that exists and can be written to"
-        ) from error
+        flush(target.parent)
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
@@ -93,7 +89,19 @@ def write_json(path: str | os.PathLike[str], value: object, *, sort_keys: bool =
     write_text(path, text + "\n")
 
 
-def _flush(path: Path) -> None:
+@contextmanager
+def refusals_told(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Tell in one line, as a `MisstepError`, why the system refuses to write `path`."""
+    try:
+        yield
+    except OSError as error:
+        reason = " ".join(str(error.strerror or error).split())
+        raise MisstepError(
+            f"cannot write {path}: {reason}; choose a folder that exists and can be written to"
+        ) from error
+
+
+def flush(path: Path) -> None:
     """Have the system bring a file or a folder onto the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:

@@ -520,7 +520,10 @@ def _check_same_kind(index: int, trajectory: Trajectory, first: Trajectory) -> N
             "all trajectories of a data set have the same dt"
         )
     for field in ("observation_columns", "action_columns"):
-        here, there = _listing(getattr(trajectory, field)), _listing(getattr(first, field))
+        here, there = (
+            column_listing(getattr(trajectory, field)),
+            column_listing(getattr(first, field)),
+        )
         if here != there:
             raise MisstepError(
                 f"trajectory {index} has {field} {here} but trajectory 0 has {there}: "
@@ -528,5 +531,6 @@ def _check_same_kind(index: int, trajectory: Trajectory, first: Trajectory) -> N
             )
 
 
-def _listing(columns: tuple[Column, ...]) -> str:
+def column_listing(columns: Sequence[Column]) -> str:
+    """Return names and units in one line: ``x [m], theta [rad]``."""
     return ", ".join(f"{column.name} [{column.unit}]" for column in columns)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from misstep.cli.options import JsonFile, parse_parameters
+from misstep.cli.options import JsonFile, SystemParameters, parse_parameters
 from misstep.cli.output import check_output_file, write_result
 from misstep.cli.progress import progress
 from misstep.errors import MisstepError
@@ -101,10 +101,7 @@ def convert(
         str | None,
         typer.Option(metavar="SYSTEM", help="What was driven, a system of `misstep list systems`."),
     ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="A parameter of the system; repeatable."),
-    ] = None,
+    set_: SystemParameters = None,
     demonstrator: Annotated[
         str | None, typer.Option("--by", metavar="NAME", help="Who acted.")
     ] = None,

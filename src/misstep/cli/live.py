@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from misstep.cli.options import JsonFile, parse_parameters
+from misstep.cli.options import JsonFile, SystemParameters, parse_parameters
 from misstep.cli.output import check_output_file, write_result
 from misstep.errors import MisstepError
 
@@ -32,10 +32,7 @@ def live(
             help="0.0.0.0: answer other machines too, such as a phone, that know the address.",
         ),
     ] = "127.0.0.1",
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="A parameter of the system; repeatable."),
-    ] = None,
+    set_: SystemParameters = None,
     json: JsonFile = None,
 ) -> int:
     """Open a page on which you fail by hand and watch it learn.

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
 SystemName = Annotated[
     str, typer.Argument(metavar="SYSTEM", help="A system of `misstep list systems`.")
 ]
+SystemParameters = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NAME=VALUE", help="A parameter of the system; repeatable."),
+]
 Success = Annotated[
     str | None,
     typer.Option(

@@ -13,6 +13,7 @@ from misstep.cli.options import (
     Seed,
     Success,
     SystemName,
+    SystemParameters,
     parse_parameters,
     system_parameters,
 )
@@ -33,10 +34,7 @@ def demonstrate(
         str, typer.Option(metavar="KIND", help="A kind of `misstep list demonstrators`.")
     ] = "noisy",
     n: Annotated[int, typer.Option("-n", help="How many failed attempts to record.")] = 4,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="A parameter of the system; repeatable."),
-    ] = None,
+    set_: SystemParameters = None,
     with_: Annotated[
         list[str] | None,
         typer.Option(

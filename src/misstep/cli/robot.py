@@ -7,14 +7,9 @@ from typing import Annotated
 
 import typer
 
-from misstep.cli.options import JsonFile, SystemName, parse_parameters
+from misstep.cli.options import JsonFile, SystemName, SystemParameters, parse_parameters
 from misstep.cli.output import check_output_file, write_result
 from misstep.robot.addresses import TOKEN
-
-_Set = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="NAME=VALUE", help="A parameter of the system; repeatable."),
-]
 
 
 def drive(
@@ -22,7 +17,7 @@ def drive(
     address: Annotated[
         str, typer.Option(metavar="ADDRESS", help="Of `misstep serve`.")
     ] = "127.0.0.1:7106",
-    set_: _Set = None,
+    set_: SystemParameters = None,
     json: JsonFile = None,
 ) -> int:
     """Let a simulation be the robot of a `misstep serve`, until its run is finished.
@@ -48,7 +43,7 @@ def offer(
     socket: Annotated[
         str, typer.Option(metavar="ADDRESS", help="Listen here: HOST:PORT or unix:PATH.")
     ] = "127.0.0.1:7107",
-    set_: _Set = None,
+    set_: SystemParameters = None,
     watchdog_ms: Annotated[
         float, typer.Option(help="Without an action for so long: to the safe action.")
     ] = 500.0,

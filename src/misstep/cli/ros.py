@@ -16,6 +16,7 @@ from misstep.cli.options import (
     Seed,
     Success,
     SystemName,
+    SystemParameters,
     parse_names,
     parse_parameters,
     system_parameters,
@@ -31,10 +32,6 @@ if TYPE_CHECKING:
     from misstep.robot.ros.bus import Bus, Recorder
     from misstep.robot.ros.joint_system import JointSystem
 
-Set = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="NAME=VALUE", help="A parameter of the system; repeatable."),
-]
 With = Annotated[
     list[str] | None,
     typer.Option("--with", metavar="NAME=VALUE", help="A parameter; repeatable."),
@@ -66,7 +63,7 @@ _SILENCE_IN_LOCK_STEP = 60.0  # s: another process may be at work for long
 def simulate(
     context: typer.Context,
     system: SystemName = "cartpole",
-    set_: Set = None,
+    set_: SystemParameters = None,
     rate: Annotated[
         float, typer.Option(metavar="HZ", help="States per second; 0: each step of the physics.")
     ] = 0.0,
@@ -105,7 +102,7 @@ def simulate(
 def control(
     context: typer.Context,
     system: SystemName = "cartpole",
-    set_: Set = None,
+    set_: SystemParameters = None,
     success: Success = None,
     failure: Failure = None,
     cost: Cost = None,
@@ -203,7 +200,7 @@ def explore(
         typer.Option("--from", metavar="FILE", help="Begin a new run from these demonstrations."),
     ] = None,
     system: Annotated[str, typer.Option(metavar="NAME", help="Of a new run.")] = "cartpole",
-    set_: Set = None,
+    set_: SystemParameters = None,
     success: Success = None,
     failure: Failure = None,
     cost: Cost = None,

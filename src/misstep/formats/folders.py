@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from misstep.errors import MisstepError
+from misstep.storage import flush, refusals_told
 
 
 def write_folder(
@@ -39,12 +40,12 @@ def write_folder(
             f"cannot write {path}: something else is there; name a folder that does not exist, or "
             "a data set of this format"
         )
-    try:
+    with refusals_told(path):
         hidden = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent))
         try:
             new = hidden / target.name
             write(new)
-            _flush(new)
+            _flush_all(new)
             if target.exists():
                 target.replace(hidden / "old")
             new.replace(target)
@@ -52,28 +53,15 @@ def write_folder(
             if (hidden / "old").exists() and not target.exists():
                 (hidden / "old").replace(target)
             shutil.rmtree(hidden, ignore_errors=True)
-        _flush_one(target.parent)
-    except OSError as error:
-        reason = " ".join(str(error.strerror or error).split())
-        raise MisstepError(
-            f"cannot write {path}: {reason}; choose a folder that exists and can be written to"
-        ) from error
+        flush(target.parent)
 
 
 def _is_empty(folder: Path) -> bool:
     return not any(folder.iterdir())
 
 
-def _flush(folder: Path) -> None:
+def _flush_all(folder: Path) -> None:
     for parent, _, names in os.walk(folder):
         for name in names:
-            _flush_one(Path(parent, name))
-        _flush_one(Path(parent))
-
-
-def _flush_one(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+            flush(Path(parent, name))
+        flush(Path(parent))

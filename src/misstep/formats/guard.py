@@ -13,7 +13,7 @@ import numpy as np
 
 from misstep.errors import MisstepError
 from misstep.formats.format import Block, Ending, Episode, Header
-from misstep.trajectory import Column
+from misstep.trajectory import column_listing
 
 
 @contextmanager
@@ -154,13 +154,9 @@ def check_same_kind(index: int, header: Header, first: Header) -> None:
             "of a file have the same; bring them to one clock with --to-rate"
         )
     for field in ("observation_columns", "action_columns"):
-        here, there = _listing(getattr(header, field)), _listing(getattr(first, field))
+        here, there = column_listing(getattr(header, field)), column_listing(getattr(first, field))
         if here != there:
             raise MisstepError(
                 f"episode_{index} has {field} {here} but episode_0 has {there}: all episodes of a "
                 "file have the same columns"
             )
-
-
-def _listing(columns: tuple[Column, ...]) -> str:
-    return ", ".join(f"{column.name} [{column.unit}]" for column in columns)

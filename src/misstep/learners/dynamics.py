@@ -125,14 +125,10 @@ class DynamicsPolicy:
         return {**self.known.arrays(), "settings": self._settings}
 
 
-@LEARNERS.register("dynamics")
 @dataclass(frozen=True)
-class Dynamics:
-    """Rung 4: a forward model learned from every attempt, and a plan in it at every step."""
+class ModelParameters:
+    """Parameters of the learners that model the system."""
 
-    horizon: int = parameter(
-        HORIZON, "control periods", "how far ahead a plan looks", at_least=2, at_most=1000
-    )
     centres: int = parameter(
         150, "", "most centres of the sparse Gaussian process", at_least=1, at_most=1000
     )
@@ -140,6 +136,16 @@ class Dynamics:
         5.0, "s", "how much of a failed trial, from its start, is learned from", above=0
     )
     rung: ClassVar[int] = 4
+
+
+@LEARNERS.register("dynamics")
+@dataclass(frozen=True)
+class Dynamics(ModelParameters):
+    """Rung 4: a forward model learned from every attempt, and a plan in it at every step."""
+
+    horizon: int = parameter(
+        HORIZON, "control periods", "how far ahead a plan looks", at_least=2, at_most=1000
+    )
 
     def __post_init__(self) -> None:
         check_parameters(self, "learner dynamics")

@@ -7,7 +7,6 @@ products.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,12 @@ from numpy.typing import NDArray
 from misstep.dynamics import Circles, Encoding
 from misstep.dynamics.imagination import Imagination, search_network
 from misstep.errors import MisstepError
-from misstep.learners.dynamics import Learned, learn_dynamics, restored_circles
+from misstep.learners.dynamics import (
+    Learned,
+    ModelParameters,
+    learn_dynamics,
+    restored_circles,
+)
 from misstep.learners.learner import LEARNERS, Evidence, Task
 from misstep.parameters import check_parameters, parameter
 
@@ -69,7 +73,7 @@ class NetworkPolicy:
 
 @LEARNERS.register("dynamics-policy")
 @dataclass(frozen=True)
-class DynamicsPolicySearch:
+class DynamicsPolicySearch(ModelParameters):
     """Rung 4: a forward model learned from every attempt, and a small policy searched in it."""
 
     units: int = parameter(16, "", "hidden units of the policy", at_least=1, at_most=200)
@@ -81,13 +85,6 @@ class DynamicsPolicySearch:
     )
     generations: int = parameter(400, "", "generations of CMA-ES", at_least=1)
     population: int = parameter(40, "", "policies in a generation", at_least=4)
-    centres: int = parameter(
-        150, "", "most centres of the sparse Gaussian process", at_least=1, at_most=1000
-    )
-    trial_seconds: float = parameter(
-        5.0, "s", "how much of a failed trial, from its start, is learned from", above=0
-    )
-    rung: ClassVar[int] = 4
 
     def __post_init__(self) -> None:
         check_parameters(self, "learner dynamics-policy")

@@ -345,10 +345,9 @@ class CartPole(System):
             simulation diverges.
         """
         if self._over:
-            raise MisstepError(
-                f"{self.system_id}: no episode is running; call reset() before step()"
-            )
-        self._advance(self._clipped(action))
+            raise self.no_episode()
+        force = self.checked_number(action, "force", "N")
+        self._advance(min(max(force, -self._force_limit), self._force_limit))
         self._t += 1
 
         observation, true_state, x, theta = self._observe()
@@ -375,20 +374,6 @@ class CartPole(System):
         """Count the control periods for which the pole has been upright, from 0 to now."""
         upright = self._upright_steps == 0 or abs(theta) < self._upright_angle
         self._held = self._held + 1 if upright else -1
-
-    def _clipped(self, action: NDArray[np.float64]) -> float:
-        action = np.asarray(action)
-        if action.shape != (1,):
-            raise MisstepError(
-                f"{self.system_id}: the action has shape {action.shape} but one force in N, "
-                "shape (1,), is wanted"
-            )
-        force = float(action[0])
-        if not math.isfinite(force):
-            raise MisstepError(
-                f"{self.system_id}: the action is {force} N, which is not a finite force"
-            )
-        return min(max(force, -self._force_limit), self._force_limit)
 
     def _advance(self, force: float) -> None:
         """Simulate one control period in which the action `force` [N] is sent."""

@@ -226,9 +226,7 @@ class GymSystem(System):
             If the episode is over, or the action has the wrong shape or is not finite.
         """
         if self._over:
-            raise MisstepError(
-                f"{self.system_id}: no episode is running; call reset() before step()"
-            )
+            raise self.no_episode()
         action = np.asarray(action)
         if action.shape != self.action_space.shape or not np.isfinite(action).all():
             raise MisstepError(

@@ -135,9 +135,7 @@ class Judged(System):
             If the episode is over, the system refuses the action, or the cost is not finite.
         """
         if self._over:
-            raise MisstepError(
-                f"{self.system_id}: no episode is running; call reset() before step()"
-            )
+            raise self.no_episode()
         observation, reward, terminated, truncated, info = self.system.step(action)
         self._watch(observation)
         fails = self._fails(observation)

@@ -170,10 +170,9 @@ class StrikingSystem(System):
             simulation diverges.
         """
         if self._over:
-            raise MisstepError(
-                f"{self.system_id}: no episode is running; call reset() before step()"
-            )
-        velocity = self._clipped(action)
+            raise self.no_episode()
+        velocity = self.checked_number(action, "velocity", "m/s")
+        velocity = min(max(velocity, 0.0), self._v_max)
         self._t += 1
         if velocity >= self._stop_speed:
             self._velocity = velocity
@@ -185,20 +184,6 @@ class StrikingSystem(System):
             self._success = self._watch()
         info = {"failed": self._over and not self._success, "success": self._success}
         return self._observe(), -self._error(), self._over, False, info
-
-    def _clipped(self, action: NDArray[np.float64]) -> float:
-        action = np.asarray(action)
-        if action.shape != (1,):
-            raise MisstepError(
-                f"{self.system_id}: the action has shape {action.shape} but one velocity in m/s, "
-                "shape (1,), is wanted"
-            )
-        velocity = float(action[0])
-        if not math.isfinite(velocity):
-            raise MisstepError(
-                f"{self.system_id}: the action is {velocity} m/s, which is not a finite velocity"
-            )
-        return min(max(velocity, 0.0), self._v_max)
 
     def _advance(self, velocity: float) -> None:
         """Simulate one control period in which the servo is told `velocity` [m/s]."""

@@ -5,6 +5,7 @@ trajectory explain itself: what each column is, in which unit, how long a step t
 parameters the same system can be built again.
 """
 
+import math
 from typing import ClassVar
 
 import gymnasium
@@ -76,3 +77,28 @@ class System(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
             f"{self.system_id} has no inverse dynamics: actions cannot be inferred from its "
             "motion, nor its equations checked; the cart-poles have"
         )
+
+    def no_episode(self) -> MisstepError:
+        """Return what `step` raises before the first `reset` and after the end of an episode."""
+        return MisstepError(f"{self.system_id}: no episode is running; call reset() before step()")
+
+    def checked_number(self, action: NDArray[np.float64], quantity: str, unit: str) -> float:
+        """Return the one number of an action, such as a force in N.
+
+        Raises
+        ------
+        MisstepError
+            If the action has another shape than (1,), or is not finite.
+        """
+        action = np.asarray(action)
+        if action.shape != (1,):
+            raise MisstepError(
+                f"{self.system_id}: the action has shape {action.shape} but one {quantity} in "
+                f"{unit}, shape (1,), is wanted"
+            )
+        number = float(action[0])
+        if not math.isfinite(number):
+            raise MisstepError(
+                f"{self.system_id}: the action is {number} {unit}, which is not a finite {quantity}"
+            )
+        return number
