@@ -6,10 +6,12 @@ import pytest
 
 import misstep
 from misstep.errors import MisstepError
+from misstep.paper.experiments import EXPLORATIONS, VARIANTS, demonstrations_of, run_cell
 from misstep.robot.gazebo.build import PACKAGES, build, library_path
 from misstep.robot.gazebo.cart_pole import CartPoleGazebo
 from misstep.robot.gazebo.world import World
 from misstep.systems import CartPole
+from misstep.systems.rendering import Painter
 
 try:
     build()
@@ -100,6 +102,23 @@ def test_it_is_failed_on_and_learned_as_any_system():
         assert ours.provenance.system == "cartpole-gazebo"
     run = misstep.learn(system, shown, "fall", state=("theta", "theta_dot"), seed=1)
     assert run.succeeded
+
+
+def test_the_paper_s_experiment_runs_on_it(tmp_path):
+    run = run_cell(tmp_path, VARIANTS["mean"], seed=0, index=0, physics="gazebo")
+    own = demonstrations_of("A", seed=0, index=0)
+    assert len(run.trials) == EXPLORATIONS
+    assert {t.provenance.system for t in (*run.demonstrations, *run.trials)} == {"cartpole-gazebo"}
+    for ours, theirs in zip(run.demonstrations, own, strict=True):
+        # The same person, the same noise: they part only as two integrators do.
+        assert np.abs(ours.observations - theirs.observations)[:20].max() < 0.01
+        assert not np.array_equal(ours.observations, theirs.observations)
+    pictures = []
+    for system in ("cartpole-gazebo", "cartpole"):
+        with Painter(system, own[0].provenance.parameters, width=128, height=64) as painter:
+            seen = dict.fromkeys(("x", "x_dot", "theta", "theta_dot"), 0.2)
+            pictures.append(painter.paint(seen, {"force": 1.0}, 0.0))
+    assert np.array_equal(*pictures)
 
 
 def test_what_gazebo_cannot_do_is_said(refused):

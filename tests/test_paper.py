@@ -182,7 +182,8 @@ def test_the_report_holds_every_figure_and_reaches_outside_for_nothing(whole):
 
 def test_tables_json_has_what_is_promised(whole):
     document = json.loads((whole / "tables.json").read_text())
-    assert document["parameters"] == {"seeds": 1, "seed": 0, "quick": True}
+    asked = {"seeds": 1, "seed": 0, "quick": True, "physics": "mujoco"}
+    assert document["parameters"] == asked
     assert np.array(document["tables"]["I"]["first_seed"]).shape == (4, 3)
     assert np.array(document["tables"]["II"]["mean"]).shape == (11, 3)
     assert np.array(document["tables"]["II"]["percentile_of_paper"]).shape == (11, 3)
@@ -212,6 +213,8 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path, whole):
     assert os.listdir(tmp_path) == ["mine.txt"]
     with pytest.raises(MisstepError, match="seeds 1, not 2"):
         reproduce(whole, seeds=2, quick=True)
+    with pytest.raises(MisstepError, match="no physics bullet: there are mujoco, gazebo"):
+        reproduce(tmp_path / "new", physics="bullet")
     with pytest.raises(MisstepError, match="seeds must be at least 1"):
         reproduce(tmp_path / "new", seeds=0)
     assert not Path(tmp_path / "new").exists()

@@ -23,6 +23,10 @@ def reproduce(
     quick: Annotated[
         bool, typer.Option("--quick", help="Only what the paper itself shows.")
     ] = False,
+    physics: Annotated[
+        str,
+        typer.Option(metavar="ENGINE", help="mujoco, or gazebo, which `make gazebo` prepares."),
+    ] = "mujoco",
     workers: Annotated[
         int | None,
         typer.Option(help="Processes; the results do not depend on it.", show_default="one a core"),
@@ -41,7 +45,13 @@ def reproduce(
     check_output_file(json, "--json")
     with progress("reproducing") as report, resumable(out, reproduction.CONFIG):
         page = reproduction.reproduce(
-            out, seeds=seeds, seed=seed, quick=quick, workers=workers, progress=report
+            out,
+            seeds=seeds,
+            seed=seed,
+            quick=quick,
+            physics=physics,
+            workers=workers,
+            progress=report,
         )
     return _conclude(page, json)
 

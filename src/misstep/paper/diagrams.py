@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Arc, Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
 
 from misstep import plots
+from misstep.paper.experiments import PHYSICS
 from misstep.paper.results import Results
 
 
@@ -18,7 +19,7 @@ def data_exchange(results: Results) -> Figure:
     _box(axes, (0.1, 1.5), "demonstrator\n(noisy control law)", plots.SERIES[3])
     _box(axes, (3.0, 1.5), "mixture\n(EM, minimum BIC)", plots.SERIES[1])
     _box(axes, (5.9, 1.5), "exploration\n(donut mixture,\ngradient ascent)", plots.SERIES[2])
-    _box(axes, (8.8, 1.5), "cart-pole\n(MuJoCo)", plots.SERIES[0])
+    _box(axes, (8.8, 1.5), f"cart-pole\n({PHYSICS[results.physics].title})", plots.SERIES[0])
     _arrow(axes, (2.3, 2.1), (3.0, 2.1))
     _arrow(axes, (5.2, 2.1), (5.9, 2.1))
     _arrow(axes, (8.1, 2.4), (8.8, 2.4))

@@ -34,6 +34,23 @@ PAPER_MEAN: Mapping[str, ParameterValue] = {"max_components": 3}
 
 
 @dataclass(frozen=True)
+class Physics:
+    """An engine that the cart-pole moves in."""
+
+    title: str
+    system: str
+    parameters: Mapping[str, ParameterValue]
+    """What the system is told beyond the calibration."""
+
+
+PHYSICS = {
+    "mujoco": Physics("MuJoCo", "cartpole", {}),
+    # It integrates with Euler steps, MuJoCo with Runge-Kutta: ten times as many are as accurate.
+    "gazebo": Physics("Gazebo's physics", "cartpole-gazebo", {"physics_step": 0.001}),
+}
+
+
+@dataclass(frozen=True)
 class Variant:
     """One way to run the experiment."""
 
@@ -133,20 +150,30 @@ VARIANTS = {
 }
 
 
-def build_system(calibration: str) -> System:
-    """Build the cart-pole of a calibration."""
-    return make_system("cartpole", **CALIBRATIONS[calibration].system)
+def build_system(calibration: str, physics: str = "mujoco") -> System:
+    """Build the cart-pole of a calibration on one of `PHYSICS`."""
+    engine = PHYSICS[physics]
+    return make_system(engine.system, **CALIBRATIONS[calibration].system, **engine.parameters)
 
 
-def demonstrations_of(calibration: str, seed: int, index: int, n: int = DEMONSTRATIONS) -> Dataset:
+def demonstrations_of(
+    calibration: str, seed: int, index: int, n: int = DEMONSTRATIONS, physics: str = "mujoco"
+) -> Dataset:
     """Record the failed demonstrations of the `index`-th repetition of a reproduction's `seed`."""
     stream = np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1)[0]
     parameters: dict[str, Any] = dict(CALIBRATIONS[calibration].demonstrator)
-    return demonstrate(build_system(calibration), "noisy", n=n, seed=int(stream), **parameters)
+    system = build_system(calibration, physics)
+    return demonstrate(system, "noisy", n=n, seed=int(stream), **parameters)
 
 
 def run_cell(
-    folder: Path, variant: Variant, seed: int, index: int, on_trial: OnTrial | None = None
+    folder: Path,
+    variant: Variant,
+    seed: int,
+    index: int,
+    *,
+    physics: str = "mujoco",
+    on_trial: OnTrial | None = None,
 ) -> Run:
     """Run one variant with one seed in its folder, from wherever it was left.
 
@@ -159,12 +186,16 @@ def run_cell(
         The reproduction's seed.
     index : int
         Which repetition.
+    physics : str
+        One of `PHYSICS`.
+    on_trial : callable, optional
+        Called after every exploration, see `misstep.learn`.
     """
     if (folder / CONFIG).exists():
         return resume(load_run(folder), on_trial=on_trial)
     return learn(
-        build_system(variant.calibration),
-        demonstrations_of(variant.calibration, seed, index),
+        build_system(variant.calibration, physics),
+        demonstrations_of(variant.calibration, seed, index, physics=physics),
         variant.learner,
         state=variant.state,
         max_trials=EXPLORATIONS,

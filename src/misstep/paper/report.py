@@ -9,6 +9,7 @@ from misstep.pages import data_url, render_page
 from misstep.paper import synthetic
 from misstep.paper.calibration import CALIBRATIONS
 from misstep.paper.claims import Claim
+from misstep.paper.experiments import PHYSICS
 from misstep.paper.printed import TABLE_1, TABLE_2
 from misstep.paper.results import Results
 from misstep.paper.videos import Video
@@ -50,6 +51,7 @@ def render(
         ],
         calibrations=CALIBRATIONS,
         synthetic=synthetic,
+        engine=PHYSICS[results.physics].title,
         headline={
             "demonstrations": shown[:, :, 0].mean(),
             "explorations": explored[:, :, 0].mean(),

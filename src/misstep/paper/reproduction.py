@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from misstep.errors import MisstepError
 from misstep.paper import figures, report, tables
 from misstep.paper.claims import Sample, judge_all
-from misstep.paper.experiments import VARIANTS, Variant, run_cell
+from misstep.paper.experiments import PHYSICS, VARIANTS, Variant, build_system, run_cell
 from misstep.paper.measures import CellMeasures, measure
 from misstep.paper.results import SHOWN_RUNS, Results, collect_calibration
 from misstep.paper.sequel import keep_sequel, summary, write_sequel_video
@@ -51,6 +51,7 @@ class ReproductionConfig:
     seeds: int
     seed: int
     quick: bool
+    physics: str = "mujoco"
     version: str = __version__
 
     @property
@@ -67,7 +68,8 @@ class ReproductionConfig:
     def command(self) -> str:
         """The command that gives the same results, wherever they are put."""
         quick = " --quick" if self.quick else ""
-        return f"misstep reproduce --seeds {self.seeds} --seed {self.seed}{quick}"
+        physics = f" --physics {self.physics}" if self.physics != "mujoco" else ""
+        return f"misstep reproduce --seeds {self.seeds} --seed {self.seed}{quick}{physics}"
 
 
 def reproduce(
@@ -76,6 +78,7 @@ def reproduce(
     seeds: int | None = None,
     seed: int = 0,
     quick: bool = False,
+    physics: str = "mujoco",
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Path:
@@ -91,6 +94,8 @@ def reproduce(
         Of the whole; same seed, same tables.
     quick : bool
         Only what the paper itself shows, on one calibration.
+    physics : str
+        The engine that the cart-pole moves in, ``mujoco`` or ``gazebo``.
     workers : int, optional
         Processes; one a core if left out. The results do not depend on it.
     progress : callable, optional
@@ -104,13 +109,17 @@ def reproduce(
     Raises
     ------
     MisstepError
-        If a number is out of range, the folder cannot be used, or it holds another reproduction.
+        If a number is out of range, there is no such engine or it is not installed, the folder
+        cannot be used, or it holds another reproduction.
     """
     seeds = (QUICK_SEEDS if quick else SEEDS) if seeds is None else seeds
     if seeds < 1 or seed < 0:
         raise MisstepError(f"seeds must be at least 1 and seed at least 0, got {seeds} and {seed}")
+    if physics not in PHYSICS:
+        raise MisstepError(f"no physics {physics}: there are {', '.join(PHYSICS)}")
+    build_system("A", physics).close()  # an engine that is not there is told before anything is run
     processes = check_workers(workers)
-    config = ReproductionConfig(seeds=int(seeds), seed=int(seed), quick=quick)
+    config = ReproductionConfig(seeds=int(seeds), seed=int(seed), quick=quick, physics=physics)
     path = out / CONFIG
     if path.exists():
         _check_same(path, config)
@@ -130,6 +139,7 @@ def resume(out: Path, *, workers: int | None = None, progress: Progress | None =
         seeds=values["seeds"],
         seed=values["seed"],
         quick=values["quick"],
+        physics=values["physics"],
         workers=workers,
         progress=progress,
     )
@@ -169,7 +179,7 @@ def _measure_apart(
 ) -> tuple[Future[dict[str, Array]], Future[list[SyntheticMeasures]]]:
     """Start what needs no run: the calibration's demonstrations, and the synthetic data."""
     return (
-        pool.submit(collect_calibration, config.seed, quick=config.quick),
+        pool.submit(collect_calibration, config.seed, quick=config.quick, physics=config.physics),
         pool.submit(synthetic_measures, config.seed, config.seeds),
     )
 
@@ -181,7 +191,12 @@ def _write_results(
     document = {
         "version": config.version,
         "command": config.command,
-        "parameters": {"seeds": config.seeds, "seed": config.seed, "quick": config.quick},
+        "parameters": {
+            "seeds": config.seeds,
+            "seed": config.seed,
+            "quick": config.quick,
+            "physics": config.physics,
+        },
         "calibrations": tables.calibrations(results),
         "tables": tables.all_tables(results),
         "claims": [claim.to_json() for claim in claims],
@@ -199,7 +214,8 @@ def _run_and_measure(out: Path, config: ReproductionConfig, name: str, index: in
     """Run one cell and write its measures; runs in a worker."""
     keep = index == 0
     folder = out / "runs" / name if keep else out / "work" / f"{name}-{index:03d}"
-    measures = measure(run_cell(folder, VARIANTS[name], config.seed, index))
+    run = run_cell(folder, VARIANTS[name], config.seed, index, physics=config.physics)
+    measures = measure(run)
     target = _cell_file(out, name, index)
     make_folder(target.parent)
     write_json(target, measures.to_json())
@@ -220,6 +236,7 @@ def _gather(
     return Results(
         seed=config.seed,
         seeds=config.seeds,
+        physics=config.physics,
         cells={
             name: [
                 CellMeasures.from_json(read_json(_cell_file(out, name, index)))
@@ -255,7 +272,7 @@ def _samples(results: Results) -> Mapping[str, list[Sample]]:
 
 def _read_config(path: Path) -> dict[str, Any]:
     values = read_json(path)
-    kinds = {"seeds": int, "seed": int, "quick": bool, "version": str}
+    kinds = {"seeds": int, "seed": int, "quick": bool, "physics": str, "version": str}
     if not isinstance(values, dict) or not all(
         isinstance(values.get(name), kind) for name, kind in kinds.items()
     ):

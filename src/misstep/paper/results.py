@@ -25,6 +25,7 @@ class Results:
 
     seed: int
     seeds: int
+    physics: str
     cells: dict[str, list[CellMeasures]]
     runs: dict[str, Run]
     synthetic: SyntheticRun
@@ -43,9 +44,11 @@ class Results:
         return np.array([cell.demonstration_costs for cell in self.cells[variant]])
 
 
-def collect_calibration(seed: int, *, quick: bool) -> dict[str, NDArray[np.float64]]:
+def collect_calibration(
+    seed: int, *, quick: bool, physics: str = "mujoco"
+) -> dict[str, NDArray[np.float64]]:
     """Return the costs of many demonstrations by calibration; only the first with `quick`."""
     names = list(CALIBRATIONS)[: 1 if quick else None]
     n = CALIBRATION_DEMONSTRATIONS
     # A repetition that no experiment uses.
-    return {name: horizon_costs(demonstrations_of(name, seed, 10**6, n)) for name in names}
+    return {name: horizon_costs(demonstrations_of(name, seed, 10**6, n, physics)) for name in names}

@@ -73,7 +73,7 @@ class Drawing(Protocol):
         """Give back what it holds."""
 
 
-# By system: with OpenGL, and without.
+# By system: with OpenGL, and without. A system that is derived from one of these looks like it.
 _DRAWINGS: dict[str, tuple[type[Drawing], type[Drawing]]] = {
     "cartpole": (CartPoleScene, CartPoleSketch),
     "cartpole-rail": (CartPoleScene, CartPoleSketch),
@@ -119,7 +119,7 @@ class Painter:
         height: int = 360,
         title: str = "",
     ) -> None:
-        _check_drawn(system)
+        _drawings_of(system)
         if width % 2 or height % 2 or min(width, height) < 64:
             raise MisstepError(
                 f"the size of a picture is {width} × {height}: both must be even and at least 64"
@@ -218,7 +218,7 @@ def frames(
     """
     # Checked here and not in the generator, whose body runs only when the first frame is wanted.
     source = trajectory.provenance
-    drawing = _check_drawn(source.system)
+    drawing, _ = _drawings_of(source.system)
     observations = _columns(trajectory, trajectory.observations, drawing.columns)
     actions = _columns(trajectory, trajectory.actions, (drawing.action_column,))
     shown = _shown_steps(trajectory, fps)
@@ -313,19 +313,22 @@ def _beside(sides: Sequence[Iterator[NDArray[np.uint8]]]) -> Iterator[NDArray[np
         yield np.concatenate(shown, axis=1)
 
 
-def _check_drawn(system: str) -> type[Drawing]:
-    """Return how the system is drawn with OpenGL."""
-    if system not in _DRAWINGS:
-        raise MisstepError(
-            f"there is no drawing of the system {system!r}; there are: {', '.join(_DRAWINGS)}"
-        )
-    return _DRAWINGS[system][0]
+def _drawings_of(system: str) -> tuple[type[Drawing], type[Drawing]]:
+    """Return how the system is drawn with OpenGL, and without."""
+    ancestors = SYSTEMS[system].__mro__ if system in SYSTEMS else ()
+    for ancestor in ancestors:
+        drawings = _DRAWINGS.get(getattr(ancestor, "system_id", ""))
+        if drawings is not None:
+            return drawings
+    raise MisstepError(
+        f"there is no drawing of the system {system!r}; there are: {', '.join(_DRAWINGS)}"
+    )
 
 
 def _drawing(
     system: str, parameters: Mapping[str, ParameterValue], width: int, height: int
 ) -> Drawing:
-    with_opengl, without = _DRAWINGS[system]
+    with_opengl, without = _drawings_of(system)
     shown = _shown_parameters(system, parameters)
     try:
         return with_opengl(shown, width, height)
@@ -375,7 +378,7 @@ def _shown_steps(trajectory: Trajectory, fps: float) -> NDArray[np.intp]:
     if not (math.isfinite(fps) and fps > 0):
         raise MisstepError(f"fps is {fps}: it must be a positive number of frames per second")
     # The margin keeps a frame that falls on an observation there, in floating point.
-    drawing = _check_drawn(trajectory.provenance.system)
+    drawing, _ = _drawings_of(trajectory.provenance.system)
     rate = fps * drawing.slow_motion
     count = math.floor(trajectory.duration * rate + 1e-6) + 1
     steps = np.floor(np.arange(count) / rate / trajectory.dt + 1e-6).astype(np.intp)
