@@ -15,10 +15,11 @@ demo: $(READY)  ## The paper, from five sets of failed demonstrations; ends with
 test: $(READY) check  ## Every check and every test.
 	$(BIN)/pytest -n 2 --ignore tests/test_hot_paths.py
 
-check: $(READY)  ## Lint, format, types, and how many instructions the two hot paths take.
+check: $(READY)  ## Lint, format, types, who imports whom, instructions of the two hot paths.
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
 	$(BIN)/pytest -q tests/test_hot_paths.py
 
 format: $(READY)  ## Mend what can be mended by a machine.
