@@ -174,6 +174,19 @@ def test_widest_gap_repeats_what_has_succeeded():
     assert strength_of("widest-gap", [success]) == pytest.approx(1.7, abs=0.05)
 
 
+@pytest.mark.parametrize("learner", ["widest-gap", "balanced-mean"])
+def test_one_success_with_a_constant_action_is_repeated(learner):
+    # A key that is held down: the same velocity all along.
+    shown = [stroke(1.0), stroke(2.0)]
+    held = stroke(1.0, outcome=Outcome.SUCCESS)
+    held = replace(held, actions=np.full_like(held.actions, 0.9))
+    policy = LEARNERS[learner]().policy(
+        TASK, Evidence((*shown, held), ()), np.random.default_rng(0)
+    )
+    for position in (0.0, 0.3, 0.9):
+        assert policy(np.array([position]))[0] == pytest.approx(0.9, abs=0.02)
+
+
 @pytest.mark.parametrize("learner", ["donut", "balanced-mean", "widest-gap"])
 def test_a_demonstration_that_succeeded_is_repeated_among_failures(learner):
     shown = [stroke(s) for s in (1.0, 1.3, 2.5)]

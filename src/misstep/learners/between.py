@@ -86,10 +86,14 @@ class _Blend(MixtureParameters):
         check_parameters(self, f"learner {self.learner}")
 
     def mixtures(
-        self, task: Task, attempts: Sequence[Trajectory], rng: np.random.Generator
+        self,
+        task: Task,
+        attempts: Sequence[Trajectory],
+        among: Sequence[Trajectory],
+        rng: np.random.Generator,
     ) -> list[GaussianMixture]:
-        """Return a mixture of each attempt."""
-        spread = joint_samples(task, attempts).std(axis=0)
+        """Return a mixture of each attempt; a column that stands still is told `among` others."""
+        spread = joint_samples(task, among).std(axis=0)
         return [self._mixture(task.joint(attempt), spread, rng) for attempt in attempts]
 
     def _mixture(self, samples: Array, spread: Array, rng: np.random.Generator) -> GaussianMixture:
@@ -124,7 +128,7 @@ class BalancedMean(_Blend):
         say = np.array([1.0 / who.count(name) for name in who])
         if evidence.trials:
             say = say * rng.exponential(size=len(say))
-        mixtures = self.mixtures(task, shown, rng)
+        mixtures = self.mixtures(task, shown, evidence.demonstrations, rng)
         return BlendPolicy(task, mixtures, say / say.sum())
 
 
@@ -144,7 +148,7 @@ class WidestGap(_Blend):
         """Return the blend of the two failures around the widest gap."""
         attempts = evidence.attempts
         succeeded = [t for t in attempts if t.outcome is Outcome.SUCCESS]
-        mixtures = self.mixtures(task, succeeded or attempts, rng)
+        mixtures = self.mixtures(task, succeeded or attempts, attempts, rng)
         if succeeded or len(mixtures) == 1:
             return BlendPolicy(task, mixtures, np.full(len(mixtures), 1.0 / len(mixtures)))
         strengths = _strengths(task, attempts, mixtures)
@@ -174,7 +178,7 @@ class RandomScaling(_Blend):
         """Return the scaled mean; the first trial is not scaled."""
         bound = np.log(self.widest)
         factor = np.exp(rng.uniform(-bound, bound)) if evidence.trials else 1.0
-        mixtures = self.mixtures(task, evidence.demonstrations, rng)
+        mixtures = self.mixtures(task, evidence.demonstrations, evidence.demonstrations, rng)
         return BlendPolicy(task, mixtures, np.full(len(mixtures), factor / len(mixtures)))
 
 
