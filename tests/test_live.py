@@ -1,13 +1,15 @@
 import asyncio
 import json
+import shutil
 import time
+import zipfile
 from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 
-from misstep import Dataset, Outcome, make_system, rollout
+from misstep import Dataset, Outcome, make_system, rollout, save_dataset
 from misstep.learners import Task
 from misstep.recordings.marking import Mark
 
@@ -15,20 +17,33 @@ pytest.importorskip("fastapi", reason="the live page needs it: pip install 'miss
 
 from misstep.live.attempt import Attempt, action_of, is_one_way
 from misstep.live.attempts import ATTEMPTS, PENDING, UNDO, Attempts
+from misstep.live.balancing import Balancing
 from misstep.live.clock import Clock
 from misstep.live.downloads import upload_suffix
 from misstep.live.guard import Guard, is_local_name
 from misstep.live.hand import Hand
+from misstep.live.jobs import describe, read_upload
 from misstep.live.narration import tell_end, tell_trial
 from misstep.live.picture import (
     rounded,
     show_mixture,
     show_recording,
     show_system,
+    still_columns,
     suggested_state,
 )
-from misstep.live.protocol import KINDS, LONGEST_MESSAGE, Allowance, NotOursError, parse
+from misstep.live.protocol import (
+    KINDS,
+    LONGEST_MESSAGE,
+    Allowance,
+    Message,
+    NotOursError,
+    parse,
+)
 from misstep.live.replay import MODULES, PAGE, replay_html
+from misstep.live.server import Page
+from misstep.live.session import Session
+from misstep.live.worker import Worker
 from misstep.mixture import GaussianMixture
 
 # Messages
@@ -52,6 +67,7 @@ def test_a_message_of_the_page_is_read():
         '{"t": "input"}',
         '{"t": "input", "v": [2], "n": 1}',
         '{"t": "input", "v": [NaN], "n": 1}',
+        '{"t": "push", "x": 1' + "0" * 400 + "}",
         '{"t": "input", "v": [Infinity], "n": 1}',
         '{"t": "input", "v": ["1"], "n": 1}',
         '{"t": "input", "v": [true], "n": 1}',
@@ -137,6 +153,87 @@ def test_an_uploaded_name_gives_a_known_suffix_or_nothing(name, refused):
     with refused("is not known here"):
         upload_suffix(name)
     assert upload_suffix("../../etc/passwd.H5") == ".h5"
+
+
+@pytest.mark.parametrize("name", ["../../outside.h5", "/outside.h5", "D.h5"])
+def test_what_was_packed_is_read_from_inside_its_own_folder(name, demonstrations, tmp_path):
+    inner = tmp_path / "a" / "b"
+    inner.mkdir(parents=True)
+    save_dataset(demonstrations, tmp_path / "D.h5")
+    with zipfile.ZipFile(inner / "upload.zip", "w") as archive:
+        archive.write(tmp_path / "D.h5", name)
+    read = read_upload(_say, _stop, path=inner / "upload.zip", system="cartpole", parameters={})
+    assert read == list(demonstrations)
+    files = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
+    assert files == {"D.h5", "a/b/upload.zip", f"a/b/upload/{name.rpartition('/')[2]}"}
+
+
+def test_what_is_no_zip_file_is_refused(tmp_path, refused):
+    (tmp_path / "upload.zip").write_bytes(b"PK\x03\x04 and no more")
+    with refused("no zip file that can be unpacked"):
+        read_upload(_say, _stop, path=tmp_path / "upload.zip", system="cartpole", parameters={})
+
+
+def _say(kind, value):
+    raise AssertionError(f"nobody asked for {kind}")
+
+
+def _stop():
+    return "halt"
+
+
+def test_a_page_that_reads_nothing_is_given_up_and_holds_no_more():
+    class Stalled:
+        """The other end of a socket whose buffers are full."""
+
+        sent = 0
+
+        async def send_text(self, text):
+            self.sent += 1
+            await asyncio.Event().wait()
+
+    async def run():
+        stalled = Stalled()
+        page = Page(stalled)
+        given_up = asyncio.create_task(page.send_all())
+        for _ in range(5000):
+            page.news("x")
+            page.frame("y")
+            await asyncio.sleep(0)
+            if given_up.done():
+                break
+        return await given_up, stalled.sent, len(page._news)
+
+    reason, sent, waiting = asyncio.run(run())
+    assert "does not read" in reason
+    assert sent == 1
+    assert waiting <= 400
+
+
+def test_a_worker_that_is_busy_does_not_hold_up_who_asks_for_more(demonstrations, tmp_path):
+    save_dataset(demonstrations, tmp_path / "D.h5")
+
+    async def run():
+        worker = Worker()
+        described = asyncio.create_task(worker.do("describe", attempts=str(tmp_path / "D.h5")))
+        await asyncio.sleep(0)
+        # Far more than a pipe holds, while the worker has not even begun to read.
+        out = tmp_path / "hdf5" / "attempts.h5"
+        out.parent.mkdir()
+        asked = worker.do("write", attempts=[demonstrations[0]] * 200, out=str(out))
+        written = asyncio.create_task(asked)
+        for _ in range(3):
+            await asyncio.sleep(0)
+        early = described.done()
+        try:
+            return early, await described, await written
+        finally:
+            worker.stop()
+
+    early, described, written = asyncio.run(run())
+    assert not early
+    assert json.loads(described)["state"] == ["x", "x_dot", "theta", "theta_dot"]
+    assert written.endswith("attempts.h5")
 
 
 # Driving
@@ -244,6 +341,62 @@ def test_no_tick_comes_early_and_the_clock_does_not_drift():
     assert clock.late <= clock.ticks
 
 
+class _Raises:
+    def reset(self):
+        pass
+
+    def __call__(self, observation):
+        raise ValueError("no\nanswer")
+
+
+def test_time_goes_on_after_a_policy_that_fails_and_a_disk_that_refuses(tmp_path):
+    class Told:
+        """A page; hears nothing that this is about."""
+
+        def news(self, message):
+            pass
+
+        def frame(self, message):
+            pass
+
+    async def until(is_so):
+        while not is_so():
+            await asyncio.sleep(0.001)
+
+    async def run():
+        session = Session(tmp_path / "data", "cartpole", {})
+        page = Told()
+        session.join(page)
+        living = asyncio.create_task(session.live())
+        do = lambda kind, **values: session.do(page, Message(kind, values))  # noqa: E731
+        try:
+            session._set_mode("balancing")
+            session.balancing = Balancing("cartpole", {}, _Raises(), np.random.default_rng(0))
+            await until(lambda: session.mode == "ready")
+            assert session.note == "it was stopped: ValueError: no answer"
+            assert session.attempts.pending is None
+
+            do("settings", strength=1.0, speed=2.0, start_angle=10.0, countdown=0)
+            do("begin")
+            shutil.rmtree(session.attempts.folder)
+            await until(lambda: session.mode == "ended")
+            assert "in memory alone" in session.note
+            assert session.attempts.pending.outcome is Outcome.FAILURE
+            session.attempts.folder.mkdir()
+            do("keep")
+            assert session.mode == "ready"
+            assert len(Attempts(session.attempts.folder)) == 1
+
+            do("begin")
+            await until(lambda: session.mode == "ended")
+            assert not living.done()
+        finally:
+            living.cancel()
+            session.close()
+
+    asyncio.run(asyncio.wait_for(run(), 60))
+
+
 # What is kept
 
 
@@ -346,6 +499,20 @@ def test_the_mixture_that_is_shown_conditions_as_the_one_that_was_fitted(cartpol
 def test_a_column_that_never_varies_shows_no_mixture(cartpole, demonstrations):
     still = replace(demonstrations[0], actions=np.zeros_like(demonstrations[0].actions))
     assert show_mixture(Task.of(cartpole), (still,), None, np.random.default_rng(0)) is None
+
+
+def test_a_column_that_stands_still_is_left_out_of_what_is_shown(demonstrations, tmp_path):
+    def still(trajectory):
+        observations = trajectory.observations.copy()
+        observations[:, 1] = 0.25
+        return replace(trajectory, observations=observations)
+
+    changed = [still(trajectory) for trajectory in demonstrations]
+    assert still_columns(list(demonstrations)) == still_columns([]) == []
+    assert still_columns(changed) == ["x_dot"]
+    save_dataset(Dataset(changed), tmp_path / "D.h5")
+    shown = json.loads(describe(_say, _stop, attempts=tmp_path / "D.h5"))
+    assert shown["state"] == ["x", "theta", "theta_dot"]
 
 
 def test_the_cart_is_left_out_only_where_no_end_of_the_rail_is_in_reach():

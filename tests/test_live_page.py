@@ -1,5 +1,6 @@
 """The page as a person meets it: in a real browser, against a real server that gets killed."""
 
+import json
 import os
 import re
 from pathlib import Path
@@ -8,13 +9,15 @@ import numpy as np
 import pytest
 from live_server import LiveServer
 
-from misstep import load_dataset, load_run
+from misstep import demonstrate, load_dataset, load_run, make_system, save_dataset
+from misstep.live.picture import show_system
 from misstep.mixture import (
     Conditioner,
     DonutMixture,
     GaussianMixture,
     exploration_from_variance,
 )
+from misstep.systems.gymnasium_adapter import KNOWN
 
 CHROMIUM = os.environ.get("CHROMIUM", "/usr/bin/chromium")
 SCREENS = Path(__file__).resolve().parents[1] / "out" / "live-screens"
@@ -57,11 +60,12 @@ def page(browser, server):
     page.context.close()
 
 
-def open_page(browser, server, size=(1280, 720), **options):
+def open_page(browser, server, size=(1280, 720), script="", **options):
     context = browser.new_context(
         viewport={"width": size[0], "height": size[1]}, accept_downloads=True, **options
     )
     context.set_default_timeout(PATIENCE)
+    context.add_init_script(script)
     page = context.new_page()
     page.faults = []
     page.on("pageerror", lambda error: page.faults.append(str(error)))
@@ -310,13 +314,13 @@ def test_a_broken_file_and_a_foreign_message_are_told_in_one_sentence(page, tmp_
     page.wait_for_selector("#notice:has-text('broken.h5 was not added')")
     page.set_input_files("#file", {"name": "x.exe", "mimeType": "", "buffer": b"MZ"})
     page.wait_for_selector("#notice:has-text('is not known here')")
-    text = page.locator("#notice").inner_text()
+    text = page.locator("#notice span").inner_text()
     assert "\n" not in text.strip()
 
 
-def test_an_attempt_is_marked_and_cut_while_it_is_replayed(page, server):
-    if page.locator("#take").count():
-        page.click("#take")
+def test_an_attempt_is_marked_and_cut_while_it_is_replayed(page, server, tmp_path):
+    take_over(page)
+    have_attempts(page, tmp_path)
     page.locator("#attempts li").first.get_by_label("Replay and mark").click()
     page.wait_for_selector("#marks", state="visible")
     before = page.locator("#marks").text_content()
@@ -327,3 +331,211 @@ def test_an_attempt_is_marked_and_cut_while_it_is_replayed(page, server):
     first = load_dataset(server.folder / "cartpole" / "attempts.h5")[0]
     assert first.failure_time == pytest.approx(0.5 * first.duration, abs=1.1 * first.dt)
     page.click("#undo")
+
+
+def take_over(page):
+    """Have this page drive, with nothing going on."""
+    if page.locator("#take").count():
+        page.click("#take")
+    page.wait_for_selector("#actions button")
+    for key, present in (("Escape", "#stop"), ("Backspace", "#discard")):
+        if page.locator(present).count():
+            page.keyboard.press(key)
+            expect(page.locator(present)).to_have_count(0)
+    page.wait_for_selector("#begin")
+
+
+def have_attempts(page, folder):
+    """Drop recordings in unless there are some."""
+    if page.locator("#attempts .n").count() == 0:
+        file = folder / "weak.h5"
+        save_dataset(demonstrate(make_system("cartpole"), by="weak", n=3, seed=0), file)
+        page.set_input_files("#file", file)
+        expect(page.locator("#attempts .n")).to_have_count(3)
+
+
+def set_slider(page, name, value):
+    page.locator(f"#{name}").evaluate(
+        "(e, value) => { e.value = value; e.dispatchEvent(new Event('input')) }", value
+    )
+
+
+PAD = """
+globalThis.pad = null;
+navigator.getGamepads = () => [null, globalThis.pad];
+globalThis.hold = (axes, ...pressed) => {
+    globalThis.pad = {
+        connected: true, axes,
+        buttons: Array.from({length: 17}, (_, i) => ({pressed: pressed.includes(i), value: 0})),
+    };
+};
+"""
+
+
+def test_a_gamepad_drives_and_lets_go_when_it_is_unplugged(browser, server):
+    page = open_page(browser, server, script=PAD)
+    take_over(page)
+    set_slider(page, "strength", 50)
+    set_slider(page, "speed", 0)  # so slow that it does not fall before all has been tried
+    set_slider(page, "countdown", 0)
+    force = page.locator("#hud b").nth(2)
+    page.evaluate("hold([0, 0], 0)")  # A starts
+    page.wait_for_selector("#fail")
+    for axes, pressed, shown in [
+        ([-0.6, 0.9], [], "−6.0 N"),
+        ([0.05, 0], [], "0.0 N"),  # nobody touches it
+        ([0, 0], [15], "+10.0 N"),
+        ([0.5, 0], [14], "−10.0 N"),
+        ([1.0, 0], [], "+10.0 N"),
+    ]:
+        page.evaluate("([axes, pressed]) => hold(axes, ...pressed)", [axes, pressed])
+        expect(force).to_have_text(shown)
+    page.evaluate("pad = null")
+    expect(force).to_have_text("0.0 N")
+    page.evaluate("hold([0, 0], 3)")  # Y: it has failed
+    page.wait_for_selector("#keep")
+    page.evaluate("hold([0, 0], 1)")  # B throws it away
+    page.wait_for_selector("#begin")
+    assert page.faults == []
+    page.context.close()
+
+
+def test_fingers_on_a_phone_push_until_they_are_lifted(browser, server):
+    page = open_page(browser, server, PHONE, has_touch=True, is_mobile=True)
+    take_over(page)
+    for name, value in (("strength", 50), ("speed", 0), ("countdown", 0)):
+        set_slider(page, name, value)
+    expect(page.locator("#speed-out")).to_have_text("0.02 ×")
+    force = page.locator("#hud b").nth(2)
+    devtools = page.context.new_cdp_session(page)
+
+    def middle(name):
+        box = page.locator(f"#{name}").bounding_box()
+        return {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+
+    def touch(kind, *points):
+        fingers = [{**point, "id": n} for n, point in points]
+        devtools.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": fingers})
+
+    page.locator("#pad-right").scroll_into_view_if_needed()
+    left, right = middle("pad-left"), middle("pad-right")
+    touch("touchStart", (0, right))  # a push starts
+    page.wait_for_selector("#fail")
+    expect(force).to_have_text("+10.0 N")
+    away = {"x": right["x"] - 90, "y": right["y"] - 160}
+    touch("touchMove", (0, away))  # off the pad, still down
+    expect(page.locator("#pad-right")).to_have_class(re.compile("down"))
+    touch("touchStart", (0, away), (1, left))
+    expect(force).to_have_text("0.0 N")
+    touch("touchEnd", (0, away))  # the first finger has gone
+    expect(force).to_have_text("−10.0 N")
+    touch("touchEnd")
+    expect(force).to_have_text("0.0 N")
+    page.locator("#fail").tap()
+    page.locator("#discard").tap()
+    page.wait_for_selector("#begin")
+    assert page.evaluate("visualViewport.scale") == 1
+    assert page.faults == []
+    page.context.close()
+
+
+def test_everything_is_reached_with_the_keyboard_alone(page, tmp_path):
+    take_over(page)
+    have_attempts(page, tmp_path)
+    page.locator("body").evaluate("e => { e.tabIndex = -1; e.focus() }")
+    seen = {}
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        name, outline = page.evaluate(
+            """() => {
+                const e = document.activeElement, style = getComputedStyle(e);
+                return [e.id || e.parentElement?.id || e.getAttribute("aria-label") || e.tagName,
+                        parseFloat(style.outlineWidth) * (style.outlineStyle !== "none")];
+            }"""
+        )
+        if name in seen and name == "system":
+            break
+        seen.setdefault(name, outline)
+    wanted = "system save-menu theme help stage begin strength speed angle countdown upload"
+    wanted += " learner more learn column measure costs"
+    assert set(wanted.split()) <= set(seen)
+    assert min(seen[name] for name in wanted.split()) >= 2
+
+    # A slider stays in hand, and the arrows that set it do not drive.
+    page.focus("#strength")
+    before = int(page.locator("#strength").input_value())
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("ArrowLeft")
+    expect(page.locator("#strength-out")).to_have_text(f"{before - 10} %")
+    assert page.locator("#begin").count() == 1
+
+    # The chart: the last one is chosen, and opened.
+    page.focus("#costs")
+    page.keyboard.press("End")
+    assert "Enter opens it" in page.locator("#costs").get_attribute("aria-label")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#player", state="visible")
+    page.keyboard.press("Escape")
+    page.wait_for_selector("#player", state="hidden")
+
+
+def set_playback(page, value):
+    page.locator("#playback").evaluate(
+        "(e, value) => { e.value = value; e.dispatchEvent(new Event('change')) }", value
+    )
+
+
+def test_a_tab_that_takes_over_goes_on_with_what_is_being_learned(browser, server, tmp_path):
+    first = open_page(browser, server)
+    take_over(first)
+    have_attempts(first, tmp_path)
+    set_playback(first, "0.1")  # so slow that there is time to pause it
+    first.select_option("#learner", "random-linear")
+    first.locator("#more summary").click()
+    first.fill("#max-trials", "2")
+    first.locator("#more summary").click()
+    first.click("#learn")
+    first.wait_for_selector("#player", state="visible")
+    first.keyboard.press("Space")
+    expect(first.locator("#play")).not_to_have_class(re.compile("playing"))
+    second = open_page(browser, server)
+    set_playback(second, "4")
+    # It has watched the first trial to its end, which does not count while another one drives.
+    expect(second.locator("#clock")).to_have_text(re.compile(r"(\d+\.\d\d) of \1 s"))
+    expect(second.locator("#notice")).to_contain_text("Another tab drives")
+    assert "Trial 1" in second.locator("#sentence").inner_text()
+    second.click("#take")
+    expect(second.locator("#sentence")).to_contain_text("Trial 2")
+    second.wait_for_selector("#learn", state="visible")
+    assert first.faults == second.faults == []
+    first.context.close()
+    second.context.close()
+
+
+def test_every_system_is_drawn(page):
+    rng = np.random.default_rng(0)
+    names = ["cartpole", "cartpole-rail", "cartpole-swingup", "flipup", "basket"]
+    names += [f"gym:{name}" for name in (*KNOWN, "Reacher-v5")]  # one of unknown columns, too
+    for name in names:
+        judge = {"success": "o0 > 2"} if name.endswith("Reacher-v5") else {}
+        system = make_system(name, **judge)
+        observation, _ = system.reset(seed=0)
+        shown = json.loads(json.dumps(show_system(name, system)))
+        space = system.action_space
+        action = rng.uniform(np.maximum(space.low, -1e3), np.minimum(space.high, 1e3))
+        inked = page.evaluate(
+            """async ([system, observation, action]) => {
+                const { Stage } = await import("misstep/stage.js");
+                const canvas = document.createElement("canvas");
+                canvas.style.cssText = "position: fixed; width: 400px; height: 300px";
+                document.body.append(canvas);
+                const stage = new Stage(canvas);
+                stage.use(system);
+                stage.draw({ observation, action, time: 0, step: 0 });
+                const pixels = canvas.getContext("2d").getImageData(0, 0, 400, 300).data;
+                canvas.remove();
+                return pixels.filter((value, i) => i % 4 === 3 && value > 0).length;
+            }""",
+            [shown, observation.tolist(), action.tolist()],
+        )
+        assert inked > 1000, name

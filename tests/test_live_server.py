@@ -13,6 +13,7 @@ from live_server import LiveServer
 
 from misstep import demonstrate, load_dataset, load_run, make_system, save_dataset
 from misstep.cli import main
+from misstep.formats import FORMATS
 from misstep.live.downloads import MOST_UPLOADED
 
 connect = pytest.importorskip(
@@ -59,6 +60,8 @@ class Socket:
         deadline = time.monotonic() + PATIENCE
         while time.monotonic() < deadline:
             message = json.loads(self.socket.recv(timeout=PATIENCE))
+            if message["t"] == "session":
+                self.latest = message
             if message["t"] == kind and accept(message):
                 return message
         raise AssertionError(f"no {kind} came")
@@ -108,6 +111,12 @@ def test_a_wrong_token_origin_or_host_gets_one_sentence_and_nothing_else(server)
     assert b"another page" in body
     status, body, _ = request(server, "", headers={"Host": "evil.example"})
     assert status == 403
+    # An upload, and the question whether it would be allowed.
+    for method in ("PUT", "OPTIONS"):
+        foreign = {"Origin": "http://evil.example"}
+        assert request(server, "api/upload?name=x.h5", method, b"x", foreign)[0] == 403
+    for path in ("api/download/csv", "api/replay", "api/upload?name=x.h5"):
+        assert request(server, path, token="A" * 24)[0] == 403
     for wrong in ({"token": "A" * 24}, {"origin": "http://evil.example"}):
         with pytest.raises(Exception, match="403"):
             Socket(server, **wrong)
@@ -159,16 +168,23 @@ def test_an_attempt_is_kept_replayed_downloaded_and_dropped_in_again(server, pag
     assert status == 200
     shown = json.loads(body)
     assert np.allclose(shown["observations"], trajectory.observations, rtol=1e-4, atol=1e-9)
-    for name, suffix in (("csv", ".csv"), ("hdf5", ".h5")):
-        status, body, headers = request(server, f"api/download/{name}")
+    formats = json.loads(request(server, "api/formats")[1])["formats"]
+    convertible = {name for name, entry in FORMATS.items() if entry.write is not None}
+    assert {entry["name"] for entry in formats} == convertible
+    for n, entry in enumerate(formats, start=1):
+        status, body, headers = request(server, f"api/download/{entry['name']}?id={kept[-1]['id']}")
         assert status == 200
-        assert headers["content-disposition"].endswith(suffix)
-        file = tmp_path / f"back{suffix}"
-        file.write_bytes(body)
-        assert len(load_dataset(file)) == len(kept)
-    status, body, _ = request(server, "api/upload?name=x.h5", "PUT", file.read_bytes())
-    assert (status, json.loads(body)) == (200, {"added": len(kept)})
-    assert len(load_dataset(attempts_file(server))) == 2 * len(kept)
+        assert headers["content-disposition"].endswith(entry["suffix"])
+        # What has no suffix of its own is told by what is in it.
+        name = f"x{entry['suffix'] or '.h5'}"
+        status, body, _ = request(server, f"api/upload?name={name}", "PUT", body)
+        assert (status, json.loads(body)) == (200, {"added": 1}), entry["name"]
+        back = load_dataset(attempts_file(server))
+        assert len(back) == len(kept) + n
+        assert np.allclose(back[-1].actions, trajectory.actions), entry["name"]
+    replay = request(server, "api/replay")[1]
+    assert b"replay-data" in replay
+    assert str(server.folder).encode() not in replay
 
 
 @pytest.mark.parametrize(
@@ -178,6 +194,7 @@ def test_an_attempt_is_kept_replayed_downloaded_and_dropped_in_again(server, pag
         ("x.h5", b"no HDF5 at all", "cannot read it"),
         ("x.h5", b"\x89HDF\r\n\x1a\n" + bytes(2000), "cannot read it"),
         ("x.csv", b"a,b\n1,2\n", ""),
+        ("x.zip", b"PK", "no zip file"),
         ("x.exe", b"MZ", "not known here"),
         ("../../attempts", b"x", "not known here"),
     ],
@@ -189,7 +206,7 @@ def test_a_broken_upload_is_refused_in_one_sentence(server, page, name, content,
     problem = json.loads(body)["problem"]
     assert said in problem
     assert "\n" not in problem
-    assert "upload.h5" not in problem
+    assert "upload" not in problem
     after = attempts_file(server).read_bytes() if attempts_file(server).exists() else None
     assert after == before
 
@@ -248,6 +265,29 @@ def test_a_flood_closes_the_socket_and_what_was_recorded_is_there(server, page):
     again = Socket(server)
     assert len(again.session()["attempts"]) == before
     again.close()
+
+
+def test_what_is_thrown_away_in_mid_attempt_can_be_taken_back(server, page):
+    if page.latest["mode"] == "ended":
+        page.send("discard")
+        page.session(mode="ready")
+    before = page.latest["attempts"]
+    page.send("settings", strength=0.5, speed=0.3, start_angle=0.0, countdown=0)
+    page.send("begin")
+    page.until("f", lambda frame: frame["k"] >= 3)
+    page.send("restart")
+    page.send("hidden", hidden=True)
+    page.session(mode="paused")
+    page.send("stop")
+    page.until("session", lambda m: m["mode"] in ("ended", "ready"))
+    page.send("undo")
+    back = page.until("session", lambda m: len(m["attempts"]) == len(before) + 1)["attempts"][-1]
+    assert back["outcome"] == "unknown"
+    assert back["duration"] >= 3 * 0.02
+    assert load_dataset(attempts_file(server))[-1].provenance.notes[0].endswith("of real time")
+    if page.latest["mode"] == "ended":
+        page.send("discard")
+        page.session(mode="ready")
 
 
 def test_of_two_tabs_one_drives_and_the_other_can_take_over(server, page):
@@ -349,3 +389,15 @@ def test_a_taken_port_is_told_in_one_line(server, tmp_path, capsys):
     assert code == 2
     assert said.count("\n") == 1
     assert "choose another --port" in said
+
+
+def test_what_cannot_be_read_at_the_start_is_told_in_one_line(tmp_path, capsys):
+    file = tmp_path / "data" / "cartpole" / "attempts.h5"
+    file.parent.mkdir(parents=True)
+    file.write_bytes(b"no recording")
+    code = main(["live", "--no-browser", "--port", "0", "--data", str(tmp_path / "data")])
+    said = capsys.readouterr().err
+    assert code == 2
+    assert said.count("\n") == 1
+    assert str(file) in said
+    assert file.read_bytes() == b"no recording"

@@ -74,7 +74,7 @@ def live(
             server.serve(app, listening, started)
         except KeyboardInterrupt as interrupt:
             kept = f"all that was recorded is in {data}; `misstep live` goes on"
-            raise KeyboardInterrupt(kept) from interrupt
+            raise type(interrupt)(kept) from interrupt
     return 0
 
 

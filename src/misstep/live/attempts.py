@@ -89,9 +89,15 @@ class Attempts:
         return Dataset(kept.trajectory for kept in self._kept)
 
     def put_aside(self, trajectory: Trajectory) -> None:
-        """Hold an attempt that has ended until `keep` or `discard`; it is in a file by then."""
+        """Hold an attempt that has ended until `keep` or `discard`; it is in a file by then.
+
+        Raises
+        ------
+        MisstepError
+            If the disk refuses it; it is held in memory then.
+        """
+        self.pending = trajectory  # also where the disk refuses it
         save_dataset(Dataset([trajectory]), self.folder / PENDING)
-        self.pending = trajectory
 
     def keep(self) -> int | None:
         """Keep the pending attempt, if there is one, and return its id."""

@@ -15,6 +15,10 @@ MOST_UPLOADED = 64 * 2**20
 """Bytes of a file that is dropped in."""
 
 
+PACKED = ".zip"
+"""Suffix of a folder that is packed into a file, for the formats that are folders."""
+
+
 def show_formats() -> list[dict[str, Any]]:
     """Return the formats in which recordings can be downloaded."""
     return [
@@ -35,7 +39,8 @@ def upload_suffix(name: str) -> str:
         If no format goes by it.
     """
     suffix = Path(name).suffix.lower()
-    known = sorted({s for e in FORMATS.values() for s in (*e.suffixes, *e.read_suffixes)})
+    files = [entry for entry in FORMATS.values() if not entry.is_folder]
+    known = sorted({PACKED, *(s for e in files for s in (*e.suffixes, *e.read_suffixes))})
     if suffix not in known:
         raise MisstepError(
             f"a file {suffix or 'without a suffix'} is not known here; known are: "
@@ -79,4 +84,4 @@ def _own_suffix(name: str) -> str:
 
 
 def _suffix(name: str) -> str:
-    return ".zip" if FORMATS[name].is_folder else _own_suffix(name)
+    return PACKED if FORMATS[name].is_folder else _own_suffix(name)

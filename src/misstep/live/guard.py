@@ -11,6 +11,8 @@ import ipaddress
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
+from misstep.errors import MisstepError
+
 Scope = dict[str, Any]
 Receive = Callable[[], Awaitable[dict[str, Any]]]
 Send = Callable[[dict[str, Any]], Awaitable[None]]
@@ -42,11 +44,13 @@ class Guard:
         self._app = app
         self._prefix = f"/{token}".encode()
         self._headers = [*HEADERS, (b"content-security-policy", policy.encode("ascii"))]
+        self.failure: MisstepError | None = None
+        """Why the application could not start, or not end as it should."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Let a request or a socket pass, or refuse it in one sentence."""
         if scope["type"] == "lifespan":
-            await self._app(scope, receive, send)
+            await self._live(scope, receive, send)
             return
         refusal = self._refusal(scope)
         if refusal is not None:
@@ -61,6 +65,13 @@ class Guard:
             await send(message)
 
         await self._app(inner, receive, send_with_headers)
+
+    async def _live(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await self._app(scope, receive, send)
+        except MisstepError as error:
+            self.failure = error
+            raise
 
     def _refusal(self, scope: Scope) -> str | None:
         headers = {name.lower(): value for name, value in scope["headers"]}

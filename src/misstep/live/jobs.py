@@ -3,8 +3,9 @@
 Each job takes plain values and paths that the server has made, never a name from the page.
 """
 
-import json
 import shutil
+import zipfile
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,16 @@ from misstep.errors import MisstepError
 from misstep.formats import FORMATS, load_dataset, save_dataset
 from misstep.learners import Task
 from misstep.learning import learn, resume
+from misstep.live.downloads import PACKED
 from misstep.live.narration import tell_trial
-from misstep.live.picture import show_mixture, show_recording, show_summary
+from misstep.live.picture import show_mixture, show_recording, show_summary, still_columns, to_json
 from misstep.runs import Run, load_run
 from misstep.systems import System, make_system
 from misstep.trajectory import Dataset, Trajectory
+
+MOST_STEPS = 300_000
+"""Of all recordings in a file that is dropped in: 100 minutes at 50 Hz."""
+_MOST_UNPACKED, _MOST_PACKED = 512 * 2**20, 5000  # bytes; files
 
 Tell = Callable[[str, Any], None]
 """``tell(kind, value)``: tell the server something while the job goes on."""
@@ -31,14 +37,15 @@ class _HaltError(Exception):
     """A person has stopped the learning."""
 
 
-def describe(tell: Tell, ask: Ask, *, attempts: str, state: Sequence[str]) -> str:
+def describe(tell: Tell, ask: Ask, *, attempts: str) -> str:
     """Return the mixture of what was recorded, as JSON; ``null`` where there is none."""
     dataset = load_dataset(attempts)
     system = _system_of(dataset)
-    known = [c.name for c in system.observation_columns]
-    chosen = [name for name in known if name in state] or known
+    chosen = [c.name for c in system.observation_columns if c.name not in still_columns(dataset)]
+    if not chosen:
+        return to_json(None)
     task = Task.of(system, chosen)
-    return _json(show_mixture(task, tuple(dataset), None, np.random.default_rng(0)))
+    return to_json(show_mixture(task, tuple(dataset), None, np.random.default_rng(0)))
 
 
 def learn_by_trial(
@@ -97,7 +104,7 @@ def open_run(tell: Tell, ask: Ask, *, folder: str) -> Run:
     """Load a run and tell its demonstrations and trials."""
     run = load_run(folder)
     system = run.config.make_system()
-    tell("demonstrations", _json([show_recording(t) for t in run.demonstrations]))
+    tell("demonstrations", to_json([show_recording(t) for t in run.demonstrations]))
     for number in range(1, len(run.trials) + 1):
         tell("trial", trial_picture(run, system, number))
     return run
@@ -108,7 +115,16 @@ def read_upload(
 ) -> list[Trajectory]:
     """Read a recording that was dropped in; it has to fit the system."""
     driven = make_system(system, **parameters)
-    dataset = load_dataset(path)
+    source = Path(path)
+    if source.suffix == PACKED:
+        source = _unpacked(source)
+    dataset = load_dataset(source)
+    steps = sum(trajectory.n_steps for trajectory in dataset)
+    if steps > MOST_STEPS:
+        raise MisstepError(
+            f"it holds {steps} steps and at most {MOST_STEPS} are taken at once: use `misstep "
+            "learn` on the command line"
+        )
     shown = [[c.name for c in cs] for cs in (dataset.observation_columns, dataset.action_columns)]
     wanted = [[c.name for c in cs] for cs in (driven.observation_columns, driven.action_columns)]
     if shown != wanted:
@@ -157,7 +173,7 @@ def trial_picture(run: Run, system: System, number: int) -> dict[str, str]:
         "computing_seconds": round(run.computing_seconds[number - 1], 4),
         "model": show_mixture(task, before, policy, rng),
     }
-    return {"summary": _json(summary), "whole": _json(whole)}
+    return {"summary": to_json(summary), "whole": to_json(whole)}
 
 
 def _teller(system: System, tell: Tell, ask: Ask) -> Callable[[Run], None]:
@@ -169,13 +185,30 @@ def _teller(system: System, tell: Tell, ask: Ask) -> Callable[[Run], None]:
     return on_trial
 
 
+def _unpacked(packed: Path) -> Path:
+    """Unpack a folder beside the file that it was packed into, and return where it begins.
+
+    Names that lead out of the folder are no concern: `zipfile` leaves such parts of them out.
+    """
+    folder = packed.with_suffix("")
+    try:
+        with zipfile.ZipFile(packed) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+            if size > _MOST_UNPACKED or len(archive.infolist()) > _MOST_PACKED:
+                raise MisstepError(
+                    f"unpacked it is larger than {_MOST_UNPACKED // 2**20} MB or has more than "
+                    f"{_MOST_PACKED} files: use `misstep convert` on the command line"
+                )
+            archive.extractall(folder)
+    except (zipfile.BadZipFile, zlib.error, RuntimeError, OSError, EOFError) as error:
+        raise MisstepError(f"it is no zip file that can be unpacked: {error}") from error
+    inside = list(folder.iterdir()) if folder.exists() else []
+    return inside[0] if len(inside) == 1 else folder
+
+
 def _system_of(dataset: Dataset) -> System:
     origin = dataset[0].provenance
     return make_system(origin.system, **origin.parameters)
-
-
-def _json(value: object) -> str:
-    return json.dumps(value, allow_nan=False, separators=(",", ":"))
 
 
 JOBS: dict[str, Callable[..., Any]] = {

@@ -73,8 +73,8 @@ def _tell_donut(trial: Trajectory, policy: DonutPolicy) -> str:
             "they had done."
         )
     return (
-        f"At {when:.2f} s the attempts before disagreed (ε = {epsilon:.2f}): there it tried "
-        f"{_signed(did)} {column.unit} where their average is {_signed(usual)} {column.unit}."
+        f"At {when:.2f} s the attempts before disagreed (ε\u00a0=\u00a0{epsilon:.2f}): there it "
+        f"tried {_signed(did)} {column.unit} where their average is {_signed(usual)} {column.unit}."
     )
 
 

@@ -4,6 +4,7 @@ Numbers are rounded to five digits: more cannot be seen, and a trial of 1,500 st
 100 kB.
 """
 
+import json
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -29,6 +30,13 @@ _FAR = 50.0  # m, an end of the rail that no attempt reaches
 _MOST_SAMPLES = 6000
 # Of each column's spread. Keys give three forces; without a width their ellipses would be lines.
 _WIDTH = 0.08
+_DRAWINGS = {
+    "basket": "basket",
+    "gym:Pendulum-v1": "pendulum",
+    "gym:InvertedPendulum-v5": "cart-with-poles",
+    "gym:InvertedDoublePendulum-v5": "cart-with-poles",
+    "gym:MountainCarContinuous-v0": "hill",
+}
 _RUNG_MEANINGS = (
     "nothing beyond the recordings",
     "whether each attempt succeeded",
@@ -47,6 +55,11 @@ def rounded(values: Any) -> Any:
     if isinstance(values, float):
         return float(f"{values:.{_DIGITS}g}") if math.isfinite(values) else None
     return values
+
+
+def to_json(value: object) -> str:
+    """Return JSON without spaces; NaN and infinities are no part of it."""
+    return json.dumps(value, allow_nan=False, separators=(",", ":"))
 
 
 def show_columns(columns: Sequence[Column]) -> list[Shown]:
@@ -161,8 +174,24 @@ def show_recording(trajectory: Trajectory) -> Shown:
 
 
 def main_column(columns: Sequence[Column]) -> str:
-    """Return the column that says most: the first angle, or the first of all."""
-    return next((c.name for c in columns if c.unit == "rad"), columns[0].name)
+    """Return the column that says most: the first angle, or its sine, or the first of all."""
+    angles = [c.name for c in columns if c.unit == "rad"]
+    return next(
+        iter([*angles, *(c.name for c in columns if c.name.startswith("sin_"))]), columns[0].name
+    )
+
+
+def still_columns(attempts: Sequence[Trajectory]) -> list[str]:
+    """Return the observation columns that have the same value in all attempts, if there are any.
+
+    Nothing can be learned from them: no mixture has a spread along them.
+    """
+    if not attempts:
+        return []
+    low = np.min([t.observations.min(axis=0) for t in attempts], axis=0)
+    high = np.max([t.observations.max(axis=0) for t in attempts], axis=0)
+    columns = attempts[0].observation_columns
+    return [column.name for column, same in zip(columns, low == high, strict=True) if same]
 
 
 def show_mixture(
@@ -229,7 +258,7 @@ def _drawing(system: System) -> str:
         return "cartpole"
     if isinstance(system, FlipUp):
         return "flipup"
-    return "basket" if system.system_id == "basket" else "generic"
+    return _DRAWINGS.get(system.system_id, "columns")
 
 
 def _first_line(doc: str | None) -> str:

@@ -5,7 +5,6 @@ is refused in one sentence, and what comes too fast is not read at all.
 """
 
 import json
-import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -39,8 +38,8 @@ def number(low: float, high: float) -> Check:
     def check(value: object) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise NotOursError(f"a number is wanted, not {_short(value)}")
-        if not math.isfinite(value) or not low <= value <= high:
-            raise NotOursError(f"{value:g} is not from {low:g} to {high:g}")
+        if not low <= value <= high:  # NaN is not either
+            raise NotOursError(f"{_short(value)} is not from {low:g} to {high:g}")
         return float(value)
 
     return check

@@ -8,20 +8,37 @@ from typing import Any
 
 PAGE = files("misstep.live").joinpath("page")
 MODULES = (
+    "actions.js",
     "app.js",
     "attempts.js",
+    "cartpole.js",
     "chart.js",
+    "columns.js",
     "density.js",
     "dialogs.js",
     "dom.js",
+    "figures.js",
+    "files.js",
+    "gymnasium.js",
+    "hand.js",
+    "hud.js",
     "input.js",
     "learning.js",
+    "library.js",
     "link.js",
+    "marks.js",
     "model.js",
+    "notice.js",
+    "path.js",
+    "pen.js",
     "plane.js",
     "player.js",
+    "settings.js",
     "stage.js",
+    "striking.js",
     "theme.js",
+    "viewer.js",
+    "words.js",
 )
 """Modules of the page; each is imported as ``misstep/NAME``."""
 

@@ -30,7 +30,7 @@ from misstep.live import downloads
 from misstep.live.guard import Guard
 from misstep.live.protocol import LONGEST_MESSAGE, Allowance, NotOursError, parse
 from misstep.live.replay import MODULES, PAGE, import_map, page_html, replay_html
-from misstep.live.session import Session
+from misstep.live.session import Session, attempt_json
 from misstep.runs import make_folder
 from misstep.storage import write_text
 from misstep.version import __version__
@@ -41,6 +41,7 @@ _OURS = 10
 """Messages of one page that are not ours, after which it is not listened to any more."""
 _MOST_WAITING = 400
 """Messages to a page that does not read them, after which it is given up."""
+_LAST_WORD = 2.0  # s, to say why a page is given up
 _MIME = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 
 
@@ -90,9 +91,13 @@ class Page:
         self._news: deque[str] = deque()
         self._frame: str | None = None
         self._something = asyncio.Event()
+        self._too_many = asyncio.Event()
 
     def news(self, message: str) -> None:
-        """Send a message; none is left out."""
+        """Send a message; none is left out, but too many that wait end the connection."""
+        if len(self._news) >= _MOST_WAITING:
+            self._too_many.set()
+            return
         self._news.append(message)
         self._something.set()
 
@@ -101,10 +106,20 @@ class Page:
         self._frame = message
         self._something.set()
 
-    async def send_all(self) -> None:
-        """Send what is to be sent until the socket closes."""
+    async def send_all(self) -> str:
+        """Send what is to be sent until the socket closes; return why the page is given up."""
+        sending = asyncio.ensure_future(self._send())
+        waiting = asyncio.ensure_future(self._too_many.wait())
+        try:
+            await asyncio.wait((sending, waiting), return_when=asyncio.FIRST_COMPLETED)
+            return "this page does not read what it is sent" if waiting.done() else ""
+        finally:
+            sending.cancel()
+            waiting.cancel()
+
+    async def _send(self) -> None:
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # RuntimeError: it is closed
-            while len(self._news) < _MOST_WAITING:
+            while True:
                 await self._something.wait()
                 self._something.clear()
                 while self._news:
@@ -112,7 +127,6 @@ class Page:
                 if self._frame is not None:
                     frame, self._frame = self._frame, None
                     await self._socket.send_text(frame)
-            await self._socket.close(1008, "this page does not read what it is sent")
 
 
 def make_app(folder: Path, system: str, parameters: Mapping[str, Any], token: str) -> Guard:
@@ -151,6 +165,11 @@ def serve(app: Guard, listening: socket.socket, started: Callable[[], None]) -> 
     listening : socket
     started : callable
         Called once it answers.
+
+    Raises
+    ------
+    MisstepError
+        If what was recorded before cannot be read.
     """
     config = uvicorn.Config(
         app,
@@ -167,7 +186,11 @@ def serve(app: Guard, listening: socket.socket, started: Callable[[], None]) -> 
     # A page that leaves in mid-answer is nothing to tell of.
     logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
     server = _Server(config, started)
-    server.run(sockets=[listening])
+    try:
+        server.run(sockets=[listening])
+    finally:
+        if app.failure is not None:  # of which uvicorn says nothing
+            raise app.failure
 
 
 class _Server(uvicorn.Server):
@@ -234,7 +257,8 @@ def _add_files(app: FastAPI) -> None:
 
     @app.get("/api/attempt/{id}")
     async def attempt(id: int) -> Response:
-        return _json(session().recording(id))
+        trajectory = session().attempts[id]
+        return _json(await asyncio.to_thread(attempt_json, id, trajectory))
 
     @app.get("/api/run/{key}/demonstrations")
     async def demonstrations(key: int) -> Response:
@@ -263,7 +287,8 @@ def _add_files(app: FastAPI) -> None:
 
     @app.get("/api/replay")
     async def replay() -> Response:
-        html = await asyncio.to_thread(replay_html, *session().replay())
+        told, recordings, trials = session().replay()
+        html = await asyncio.to_thread(lambda: replay_html(told, recordings(), trials))
         return HTMLResponse(html, headers=_attachment("misstep-replay.html"))
 
     @app.put("/api/upload")
@@ -276,7 +301,8 @@ def _add_files(app: FastAPI) -> None:
             try:
                 count = await session().take_in(path)
             except MisstepError as error:
-                raise MisstepError(str(error).replace(str(path), "it")) from error
+                said = str(error).replace(str(path), "it").replace(str(path.with_suffix("")), "it")
+                raise MisstepError(said) from error
         return JSONResponse({"added": count})
 
 
@@ -315,15 +341,20 @@ async def _talk(socket: WebSocket) -> None:
     await socket.accept()
     page = Page(socket)
     session.join(page)
-    sending = asyncio.create_task(page.send_all())
+    both = [
+        asyncio.create_task(_hear(socket, session, page)),
+        asyncio.create_task(page.send_all()),
+    ]
     try:
-        reason = await _hear(socket, session, page)
+        done, _ = await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
+        reason = next((task.result() for task in done if task.result()), "")
         if reason:
-            with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # it has gone meanwhile
-                await socket.close(1008, reason)
+            with contextlib.suppress(WebSocketDisconnect, RuntimeError, TimeoutError):  # it is gone
+                await asyncio.wait_for(socket.close(1008, reason), _LAST_WORD)
     finally:
         session.leave(page)
-        sending.cancel()
+        for task in both:
+            task.cancel()
 
 
 async def _hear(socket: WebSocket, session: Session, page: Page) -> str:

@@ -9,33 +9,34 @@ one of these modes::
 """
 
 import asyncio
-import contextlib
-import json
-import math
 import re
+import secrets
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from misstep.errors import MisstepError
 from misstep.learners import LEARNERS
-from misstep.live.attempt import Attempt, action_of, is_one_way
-from misstep.live.attempts import Attempts, Kept
+from misstep.live.attempts import Attempts
+from misstep.live.audience import Audience, Listener
+from misstep.live.balancing import Balancing
 from misstep.live.clock import Clock
-from misstep.live.hand import Hand
+from misstep.live.description import Description
+from misstep.live.driving import Driving, Settings
 from misstep.live.lesson import Lesson
-from misstep.live.narration import tell_end
+from misstep.live.listing import Listing, show_pending, unfit_learners
 from misstep.live.picture import (
     rounded,
     show_learners,
     show_recording,
-    show_summary,
     show_system,
     show_systems,
+    still_columns,
+    to_json,
 )
 from misstep.live.protocol import Message
 from misstep.live.worker import Worker
@@ -47,37 +48,18 @@ SILENCE = 4.0
 """Seconds without a word from the page that drives, after which an attempt is paused."""
 
 _COUNT = 0.6  # s, one number of the countdown
-_ENDLESS = 3600.0  # s, an episode of the learned policy
-_FALLEN_FOR = 1.5  # s, how long a fallen policy lies before it starts again
 _AHEAD = "countdown", "driving", "balancing"
 
-Frame = dict[str, Any]
 
-
-@dataclass(frozen=True)
-class Settings:
-    """How a person drives."""
-
-    strength: float = 0.5
-    """Share of the actuator's range that a full push is."""
-    speed: float = 0.35
-    """Seconds of the system in a second."""
-    start_angle: float | None = None
-    """Where an attempt starts, deg; None: where the system says."""
-    countdown: int = 2
-
-
-_STROKE_SPEED = 0.05  # a strike lasts a tenth of a second
-
-
-class Listener(Protocol):
-    """A page that is connected."""
-
-    def news(self, message: str) -> None:
-        """Send a message; none is left out."""
-
-    def frame(self, message: str) -> None:
-        """Send a state, in place of one that has not been sent yet."""
+_DOING = {
+    "countdown": "an attempt is running",
+    "driving": "an attempt is running",
+    "paused": "an attempt is paused",
+    "ended": "an attempt waits: keep it (Enter) or throw it away (Backspace)",
+    "learning": "it is learning",
+    "balancing": "the learned policy is running",
+    "ready": "no attempt is running",
+}
 
 
 class Session:
@@ -102,8 +84,7 @@ class Session:
         self.folder = folder
         self.mode = "ready"
         self.worker = Worker()
-        self.listeners: list[Listener] = []
-        self.driver: Listener | None = None
+        self.audience = Audience()
         self._given = {system: dict(parameters)}
         self._systems = show_systems()
         if system not in {shown["name"] for shown in self._systems}:
@@ -114,11 +95,10 @@ class Session:
         self._dirty = False
         self._rng = np.random.default_rng()
         self._tasks: set[asyncio.Task[Any]] = set()
-        self._hand: list[float] = []
         self._acknowledged = 0
         self._heard = time.monotonic()
-        self._describing = 0
-        self._use(system, 0)
+        # Not the same again when the server is: a page can have been away meanwhile.
+        self._use(system, secrets.randbelow(2**31))
 
     # The system and what is at hand of it
 
@@ -128,35 +108,31 @@ class Session:
         folder = self.folder / re.sub(r"[^\w.-]", "-", name)
         self.attempts = Attempts(folder)
         self.lesson = Lesson(self.worker, folder / "runs", key, self.changed)
-        self._summaries: dict[int, tuple[Trajectory, dict[str, Any]]] = {}
+        self.description = Description(self.worker, self.attempts.path, self._tell_model)
+        self._listing = Listing()
         self.system, self.name = system, name
         self.shown_system = show_system(name, system)
-        self.settings = Settings(speed=_STROKE_SPEED) if is_one_way(system) else Settings()
-        self.model: str | None = None
+        self.driving = Driving(system, self._rng)
         self.note = ""
-        self.attempt = Attempt(system, 0)
         self._set_mode("ended" if self.attempts.pending is not None else "ready")
-        self._describe()
+        self._recorded()
 
     # Pages
 
     def join(self, listener: Listener) -> None:
         """Have a page take part; it drives if none does."""
-        self.listeners.append(listener)
-        if self.driver is None:
-            self.driver = listener
+        if self.audience.join(listener):
             self._heard = time.monotonic()
-        listener.news(_json({"t": "hello", "systems": self._systems, "learners": self._learners}))
+        listener.news(to_json({"t": "hello", "systems": self._systems, "learners": self._learners}))
         listener.news(self._snapshot(listener, self._told()))
-        listener.news(f'{{"t":"model","model":{self.model or "null"}}}')
+        listener.news(self._model())
         listener.frame(self._frame())
         self.changed()
 
     def leave(self, listener: Listener) -> None:
         """Have a page go; what it drives is paused, until it or another one goes on."""
-        self.listeners.remove(listener)
-        if self.driver is listener:
-            self.driver = self.listeners[0] if self.listeners else None
+        if self.audience.leave(listener):
+            self.driving.hand = []
             self._pause("the page that drove has gone: the attempt waits")
         self.changed()
 
@@ -169,75 +145,54 @@ class Session:
     def _tell_all(self) -> None:
         self._dirty = False
         told = self._told()
-        for listener in self.listeners:
+        for listener in self.audience:
             listener.news(self._snapshot(listener, told))
 
+    def _tell_model(self) -> None:
+        self.audience.news(self._model())
+
+    def _model(self) -> str:
+        return f'{{"t":"model","model":{self.description.model}}}'
+
     def _snapshot(self, listener: Listener, told: dict[str, Any]) -> str:
-        return _json({"t": "session", "drives": listener is self.driver, **told})
+        return to_json({"t": "session", "drives": listener is self.audience.driver, **told})
 
     def _told(self) -> dict[str, Any]:
         return {
             "mode": self.mode,
             "system": self.shown_system,
-            "settings": asdict(self.settings),
-            "attempts": [self._summary(kept) for kept in self.attempts],
-            "pending": self._show_pending(),
+            "settings": asdict(self.driving.settings),
+            "attempts": self._listing.show(self.attempts),
+            "pending": show_pending(self.attempts.pending, self.system),
             "can_undo": self.attempts.can_undo,
             "runs": self.lesson.runs(),
             "run": self.lesson.run,
             "watch": self.lesson.watch,
             "note": self.note,
             "folder": str(self.folder),
-            "fits": self._fitting(),
+            "fits": unfit_learners(self.attempts, self.system),
+            "still": self._still,
         }
 
-    def _summary(self, kept: Kept) -> dict[str, Any]:
-        """Return one attempt for the list; made once, as a snapshot holds hundreds."""
-        trajectory, summary = self._summaries.get(kept.id, (None, {}))
-        if trajectory is not kept.trajectory:
-            summary = {"id": kept.id, **show_summary(kept.trajectory)}
-            self._summaries[kept.id] = kept.trajectory, summary
-        return summary
-
-    def _show_pending(self) -> dict[str, Any] | None:
-        pending = self.attempts.pending
-        if pending is None:
-            return None
-        return {**show_summary(pending), "sentence": tell_end(pending, self.system)}
-
-    def _fitting(self) -> dict[str, str]:
-        """Return why learners cannot be taken now, by name."""
-        reasons = {}
-        failed = any(k.trajectory.failure_step is not None for k in self.attempts)
-        for name, kind in LEARNERS.items():
-            if not len(self.attempts):
-                reasons[name] = "keep at least one failed attempt first"
-            elif kind.rung >= 4 and self.system.cost is None:
-                reasons[name] = "this system has no cost as a function"
-            elif kind.rung == 2 and not failed:
-                reasons[name] = "no attempt has a failure time: mark one"
-        return reasons
-
     def _frame(self) -> str:
-        shown: Frame = {
+        seen = self.balancing or self.driving
+        shown: dict[str, Any] = {
             "t": "f",
-            "o": rounded(self.attempt.observation),
-            "a": rounded(self._action),
-            "k": self.attempt.n_steps,
+            "o": rounded(seen.attempt.observation),
+            "a": rounded(seen.action),
+            "k": seen.attempt.n_steps,
             "n": self._acknowledged,
             "late": self._clock.late,
             "ticks": self._clock.ticks,
         }
         if self.mode == "countdown":
             shown["left"] = self._left
-        if self.mode == "balancing":
-            shown["hold"] = rounded(self._hand_at.place)
-        return _json(shown)
+        if self.balancing is not None:
+            shown["hold"] = rounded(self.balancing.hand.place)
+        return to_json(shown)
 
     def _send_frame(self) -> None:
-        frame = self._frame()
-        for listener in self.listeners:
-            listener.frame(frame)
+        self.audience.frame(self._frame())
 
     # What a page asks for
 
@@ -251,16 +206,17 @@ class Session:
         """
         kind, values = message.kind, message.values
         if kind == "take":
-            if self.driver is not listener:
+            if self.audience.driver is not listener:
+                self.driving.hand = []
                 self._pause("another tab drives now")
-                self.driver = listener
-        elif self.driver is not listener:
+                self.audience.driver = listener
+        elif self.audience.driver is not listener:
             if kind in ("alive", "hidden", "input"):
                 return
             raise MisstepError("another tab drives; press “Drive here” to take over")
         self._heard = time.monotonic()
         if kind == "input":
-            self._hand, self._acknowledged = values["v"], values["n"]
+            self.driving.hand, self._acknowledged = values["v"], values["n"]
             return
         if kind == "alive":
             return
@@ -272,23 +228,13 @@ class Session:
 
     def _need(self, *modes: str) -> None:
         if self.mode not in modes:
-            doing = {
-                "countdown": "an attempt is running",
-                "driving": "an attempt is running",
-                "paused": "an attempt is paused",
-                "ended": "an attempt waits: keep it (Enter) or throw it away (Backspace)",
-                "learning": "it is learning",
-                "balancing": "the learned policy is running",
-                "ready": "no attempt is running",
-            }
-            raise MisstepError(f"not now: {doing[self.mode]}")
+            raise MisstepError(f"not now: {_DOING[self.mode]}")
 
     def _set_mode(self, mode: str) -> None:
         self.mode = mode
-        self._hand = []
-        self._action = np.zeros(len(self.system.action_columns))
+        self.driving.let_go()
         self._left = 0
-        self._hand_at = Hand(self.system)
+        self.balancing: Balancing | None = None
         self._clock.restart()
         self._wake.set()
 
@@ -300,22 +246,23 @@ class Session:
 
     def _do_restart(self) -> None:
         self._need("ready", "countdown", "driving", "paused", "ended")
-        self.attempts.discard()
+        self._throw_away()
         self._begin()
 
-    def _begin(self) -> None:
-        angle = self.settings.start_angle
-        start = None if angle is None else math.radians(angle)
-        self.attempt = Attempt(self.system, int(self._rng.integers(2**31)), start)
-        self.note = ""
-        self._set_mode("countdown" if self.settings.countdown else "driving")
-        self._left = self.settings.countdown
-        self._clock.period = _COUNT if self._left else self._period
-        self._send_frame()
+    def _throw_away(self) -> None:
+        """Throw away what waits or is running; `undo` brings it back."""
+        if self.mode in ("countdown", "driving", "paused"):
+            self._end()
+        self.attempts.discard()
 
-    @property
-    def _period(self) -> float:
-        return self.system.dt / self.settings.speed
+    def _begin(self) -> None:
+        self.driving.begin()
+        self.note = ""
+        countdown = self.driving.settings.countdown
+        self._set_mode("countdown" if countdown else "driving")
+        self._left = countdown
+        self._clock.period = _COUNT if countdown else self.driving.period
+        self._send_frame()
 
     def _do_stop(self) -> None:
         if self.mode == "balancing":
@@ -328,7 +275,7 @@ class Session:
 
     def _do_fail(self) -> None:
         self._need("driving", "paused")
-        self.attempt.fail_now()
+        self.driving.attempt.fail_now()
         self._end()
 
     def _do_pause(self) -> None:
@@ -338,10 +285,11 @@ class Session:
     def _do_resume(self) -> None:
         self._need("paused")
         self.note = ""
-        hand = self._hand
+        self._drive()
+
+    def _drive(self) -> None:
         self._set_mode("driving")
-        self._hand = hand
-        self._clock.period = self._period
+        self._clock.period = self.driving.period
 
     def _do_hidden(self, hidden: bool) -> None:
         if hidden:
@@ -360,36 +308,37 @@ class Session:
         self._need("ended")
         self.attempts.keep()
         self._back_to_start()
-        self._describe()
+        self._recorded()
 
     def _do_discard(self) -> None:
         self._need("ended", "paused")
-        self.attempts.discard()
+        self._throw_away()
         self._back_to_start()
 
     def _back_to_start(self) -> None:
-        self.attempt = Attempt(self.system, int(self._rng.integers(2**31)))
+        self.driving.rest()
         self.note = ""
         self._set_mode("ready")
         self._send_frame()
 
     def _end(self) -> None:
         """End the attempt; what was recorded is in a file before anybody decides on it."""
-        speed = self.settings.speed
-        notes = () if speed == 1.0 else (f"time: driven by hand at {speed:g} of real time",)
-        trajectory = self.attempt.trajectory(notes)
+        trajectory = self.driving.recorded()
         if trajectory is None:
             self._back_to_start()
         else:
-            self.attempts.put_aside(trajectory)
+            try:
+                self.attempts.put_aside(trajectory)
+            except MisstepError as error:
+                self.note = f"{error}; the attempt is in memory alone: keep it to try again"
             self._set_mode("ended")
         self._send_frame()
         self.changed()
 
     def _do_settings(self, **settings: Any) -> None:
-        self.settings = Settings(**settings)
+        self.driving.settings = Settings(**settings)
         if self.mode == "driving":
-            self._clock.period = self._period
+            self._clock.period = self.driving.period
 
     def _do_system(self, name: str) -> None:
         self._need("ready", "ended")
@@ -404,7 +353,7 @@ class Session:
     def _do_delete(self, id: int) -> None:
         self._quiet()
         self.attempts.delete(id)
-        self._describe()
+        self._recorded()
 
     def _do_mark(
         self,
@@ -421,12 +370,17 @@ class Session:
         part = None if usable is None else (usable[0], usable[1])
         said = None if outcome is None else Outcome(outcome)
         self.attempts.mark(id, Mark(said, failure_time, part))
-        self._describe()
+        self._recorded()
 
     def _do_undo(self) -> None:
         self._quiet()
         self.note = self.attempts.undo()
-        self._describe()
+        self._recorded()
+
+    def _recorded(self) -> None:
+        """Draw the consequences of a change of what was recorded."""
+        self._still = still_columns([kept.trajectory for kept in self.attempts])
+        self.description.renew()
 
     def _quiet(self) -> None:
         """Refuse changes to what was recorded while something is going on."""
@@ -441,62 +395,34 @@ class Session:
             If the file cannot be read, or does not fit the system.
         """
         self._quiet()
+        attempts = self.attempts
         read = await self.worker.do(
             "read", path=str(path), system=self.name, parameters=self._given.get(self.name, {})
         )
         self._quiet()
-        self.attempts.add(read)
-        self._describe()
+        if attempts is not self.attempts:
+            raise MisstepError("another system was chosen meanwhile: add it again")
+        attempts.add(read)
+        self._recorded()
         self.changed()
         return len(read)
 
-    def recording(self, id: int) -> str:
-        """Return an attempt as JSON.
+    def replay(self) -> tuple[dict[str, Any], Callable[[], list[str]], list[str]]:
+        """Return what a replay needs: the session, its demonstrations and its trials as JSON.
 
-        Raises
-        ------
-        MisstepError
-            If it is not there.
+        The demonstrations are made when asked for: that takes long, and can be done in a thread.
         """
-        return _json({"id": id, **show_recording(self.attempts[id])})
-
-    def replay(self) -> tuple[dict[str, Any], list[str], list[str]]:
-        """Return what a replay needs: the session, its demonstrations and its trials as JSON."""
-        session = self._told()
+        # Where it lies on this machine is nobody's business whom the replay is sent to.
+        session = {**self._told(), "folder": ""}
         run, shown = self.lesson.replayed()
+        session["run"] = run and {**run, "folder": ""}
         if shown is None:
-            recordings = [
-                {"id": kept.id, **show_recording(kept.trajectory)} for kept in self.attempts
-            ]
-        else:  # of a run that was opened, the attempts are those that it started from
-            recordings = shown
-            whole = ("observations", "actions")
-            listed = [{k: v for k, v in one.items() if k not in whole} for one in recordings]
-            session = {**session, "attempts": listed}
-        told = [_json(one) for one in recordings]
-        return {**session, "run": run}, told, list(self.lesson.trials)
-
-    def _describe(self) -> None:
-        """Have a mixture fitted to what was recorded, for the plane."""
-        self._describing += 1
-        if len(self.attempts) == 0:
-            self.model = None
-            self._tell_model()
-            return
-        self._spawn(self._describe_when_quiet(self._describing))
-
-    async def _describe_when_quiet(self, number: int) -> None:
-        path = str(self.attempts.path)
-        # A mixture that cannot be fitted is not shown, and learning will say why.
-        with contextlib.suppress(MisstepError):
-            model = await self.worker.do("describe", attempts=path, state=[])
-            if number == self._describing:
-                self.model = model
-                self._tell_model()
-
-    def _tell_model(self) -> None:
-        for listener in self.listeners:
-            listener.news(f'{{"t":"model","model":{self.model or "null"}}}')
+            held = list(self.attempts)
+            return session, lambda: [attempt_json(*kept) for kept in held], list(self.lesson.trials)
+        # Of a run that was opened, the attempts are those that it started from.
+        whole = ("observations", "actions")
+        session["attempts"] = [{k: v for k, v in o.items() if k not in whole} for o in shown]
+        return session, lambda: [to_json(one) for one in shown], list(self.lesson.trials)
 
     # Learning
 
@@ -505,10 +431,11 @@ class Session:
         shown = len(self.attempts.dataset)
         if learner not in LEARNERS:
             raise MisstepError("there is no such learner")
-        if learner in (reasons := self._fitting()):
+        if learner in (reasons := unfit_learners(self.attempts, self.system)):
             raise MisstepError(f"{learner} cannot learn from this: {reasons[learner]}")
         known = [c.name for c in self.system.observation_columns]
-        chosen = [column for column in known if column in state] or known
+        varied = [column for column in known if column not in self._still]
+        chosen = [column for column in known if column in state] or varied or known
         self._start_learning(
             self.lesson.learn(
                 learner,
@@ -537,11 +464,14 @@ class Session:
     def _start_learning(self, end: Awaitable[str]) -> None:
         self.note = ""
         self._set_mode("learning")
-        self._spawn(self._learn(end))
+        task = asyncio.get_running_loop().create_task(self._learn(end))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
     async def _learn(self, end: Awaitable[str]) -> None:
         self.note = await end
         self._back_to_ready()
+        self.description.catch_up()
         self.changed()
 
     def _back_to_ready(self) -> None:
@@ -565,32 +495,24 @@ class Session:
 
     def _do_balance(self) -> None:
         self._need("ready")
-        self._policy = self.lesson.policy()
-        parameters = dict(self._given.get(self.name, {}))
-        if "duration" in self.system.parameters:
-            parameters["duration"] = _ENDLESS
-        self._stage = make_system(self.name, **parameters)
-        self._stand_up()
+        given = self._given.get(self.name, {})
+        balancing = Balancing(self.name, given, self.lesson.policy(), self._rng)
+        self.note = ""
         self._set_mode("balancing")
-        self._hand_at = Hand(self._stage)
+        self.balancing = balancing
         self._clock.period = self.system.dt
-
-    def _stand_up(self) -> None:
-        self.attempt = Attempt(self._stage, int(self._rng.integers(2**31)))
-        self._fallen = 0
-        self._policy.reset()
 
     def _do_rest(self) -> None:
         self._need("balancing")
         self._back_to_ready()
 
     def _do_push(self, x: float | None) -> None:
-        if self.mode == "balancing":
-            self._hand_at.hold(x)
+        if self.balancing is not None:
+            self.balancing.hand.hold(x)
 
     def _do_poke(self, side: float) -> None:
-        if self.mode == "balancing":
-            self._hand_at.poke(side)
+        if self.balancing is not None:
+            self.balancing.hand.poke(side)
 
     # Time
 
@@ -605,64 +527,52 @@ class Session:
             await self._clock.tick()
             try:
                 self._tick()
-            except MisstepError as error:
-                self.note = str(error)
-                self._end()
+            except Exception as error:
+                # Whatever a policy or an environment raises: time goes on, and the page is told.
+                self._stumble(error)
+
+    def _stumble(self, error: Exception) -> None:
+        """End what went wrong, and keep what was recorded of it."""
+        said = str(error) if isinstance(error, MisstepError) else f"{type(error).__name__}: {error}"
+        self.note = f"it was stopped: {' '.join(said.split())}"
+        if self.mode == "driving":
+            self._end()
+        else:
+            self._back_to_ready()
+            self.changed()
 
     def _tick(self) -> None:
         if self.mode == "countdown":
             self._left -= 1
             if self._left <= 0:
-                hand = self._hand
-                self._set_mode("driving")
-                self._hand = hand
-                self._clock.period = self._period
+                self._drive()
                 self.changed()
             self._send_frame()
         elif self.mode == "driving":
-            self._drive()
-        elif self.mode == "balancing":
-            self._balance()
+            self.driving.step()
+            if self.driving.attempt.over:
+                self._end()
+            else:
+                self._send_frame()
+        elif self.balancing is not None:
+            self.balancing.step()
+            self._send_frame()
         if self.mode in _AHEAD and time.monotonic() - self._heard > SILENCE:
             self._pause("nothing was heard from the page: the attempt waits")
-
-    def _drive(self) -> None:
-        self._action = action_of(self.system, self._hand, self.settings.strength)
-        # A stroke begins with the first push: standing still would be its end.
-        idle = is_one_way(self.system) and not self.attempt.n_steps and not np.any(self._action)
-        if not idle:
-            self.attempt.step(self._action)
-        if self.attempt.over:
-            self._end()
-        else:
-            self._send_frame()
-
-    def _balance(self) -> None:
-        if self.attempt.over:
-            self._fallen += 1
-            if self._fallen * self.system.dt > _FALLEN_FOR:
-                self._stand_up()
-        else:
-            self._hand_at.act()
-            self._action = self._policy(self.attempt.observation)
-            self.attempt.step(self._action)
-        self._send_frame()
 
     # The end
 
     def close(self) -> None:
         """Put aside what is being recorded, and end the worker."""
-        if self.mode in ("driving", "paused", "countdown"):
-            trajectory = self.attempt.trajectory(("end: the server was stopped",))
-            if trajectory is not None:
-                self.attempts.put_aside(trajectory)
-        self.worker.stop()
-
-    def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.get_running_loop().create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        try:
+            if self.mode in ("driving", "paused", "countdown"):
+                trajectory = self.driving.recorded("end: the server was stopped")
+                if trajectory is not None:
+                    self.attempts.put_aside(trajectory)
+        finally:
+            self.worker.stop()
 
 
-def _json(value: object) -> str:
-    return json.dumps(value, allow_nan=False, separators=(",", ":"))
+def attempt_json(id: int, trajectory: Trajectory) -> str:
+    """Return an attempt as JSON."""
+    return to_json({"id": id, **show_recording(trajectory)})

@@ -10,6 +10,7 @@ import contextlib
 import itertools
 import multiprocessing
 import os
+import queue
 import signal
 import threading
 from collections.abc import Callable
@@ -20,6 +21,9 @@ from misstep.errors import MisstepError
 
 OnNews = Callable[[str, Any], None]
 """``on_news(kind, value)``: what a job tells while it goes on."""
+
+
+_HANG_UP = object()
 
 
 class _Job(NamedTuple):
@@ -38,7 +42,7 @@ class Worker:
         self._numbers = itertools.count(1)
         self._jobs: dict[int, _Job] = {}
         self._process: Any = None
-        self._pipe: Connection | None = None
+        self._outgoing: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.waiting = False
         """Whether a job waits for `reply`."""
 
@@ -56,7 +60,8 @@ class Worker:
         finally:
             signal.signal(signal.SIGINT, before)
         theirs.close()
-        self._process, self._pipe = process, ours
+        self._process, self._outgoing = process, queue.SimpleQueue()
+        threading.Thread(target=_speak, args=(ours, self._outgoing), daemon=True).start()
         threading.Thread(target=self._listen, args=(ours, process), daemon=True).start()
 
     async def do(self, job: str, on_news: OnNews | None = None, /, **arguments: Any) -> Any:
@@ -72,7 +77,7 @@ class Worker:
         result = self._loop.create_future()
         self._jobs[number] = _Job(result, on_news)
         try:
-            self._send((number, job, arguments))
+            self._outgoing.put((number, job, arguments))
             return await result
         finally:
             self._jobs.pop(number, None)
@@ -81,7 +86,7 @@ class Worker:
         """Tell the job that waits how to go on."""
         if self.waiting:
             self.waiting = False
-            self._send(word)
+            self._outgoing.put(word)
 
     def stop(self) -> None:
         """End the process and whatever it is doing."""
@@ -91,22 +96,18 @@ class Worker:
             process.join()
             self._bury(process)
 
-    def _send(self, message: Any) -> None:
-        if self._pipe is None:
-            raise MisstepError("the process that learns is not running")
-        with contextlib.suppress(OSError):  # it has died; the listener says so to all who wait
-            self._pipe.send(message)
-
     def _listen(self, pipe: Connection, process: Any) -> None:
         """Pass on what the process tells, in a thread of its own, until it ends."""
         with contextlib.suppress(EOFError, OSError, RuntimeError):  # RuntimeError: the loop is over
             while True:
                 message = pipe.recv()
-                self._loop.call_soon_threadsafe(self._hear, *message)
+                self._loop.call_soon_threadsafe(self._hear, process, *message)
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(self._bury, process)
 
-    def _hear(self, number: int, kind: str, value: Any) -> None:
+    def _hear(self, process: Any, number: int, kind: str, value: Any) -> None:
+        if process is not self._process:  # what it had still said when it was stopped
+            return
         if kind == "waits":
             self.waiting = True
         job = self._jobs.get(number)
@@ -123,9 +124,17 @@ class Worker:
         if process is not self._process:
             return
         self._process, self.waiting = None, False
+        self._outgoing.put(_HANG_UP)
         for job in self._jobs.values():
             if not job.result.done():
                 job.result.set_exception(StoppedError("it was stopped before it was done"))
+
+
+def _speak(pipe: Connection, outgoing: "queue.SimpleQueue[Any]") -> None:
+    """Pass on what is sent, in a thread of its own: a process that is busy does not read it."""
+    with contextlib.suppress(OSError):  # it has died; the listener says so to all who wait
+        while (message := outgoing.get()) is not _HANG_UP:
+            pipe.send(message)
 
 
 class StoppedError(MisstepError):

@@ -71,8 +71,9 @@ export class Density {
 
   drawChoice(pen, x, floor) {
     pen.strokeStyle = pen.fillStyle = colours.path;
-    pen.lineWidth = 2;
+    const zoom = fontSize() / 15;
+    pen.lineWidth = 2 * zoom;
     pen.beginPath(); pen.moveTo(x, 4); pen.lineTo(x, floor); pen.stroke();
-    pen.beginPath(); pen.moveTo(x, floor - 1); pen.lineTo(x - 6, floor + 8); pen.lineTo(x + 6, floor + 8); pen.closePath(); pen.fill();
+    pen.beginPath(); pen.moveTo(x, floor - 7 * zoom); pen.lineTo(x - 6 * zoom, floor + 2 * zoom); pen.lineTo(x + 6 * zoom, floor + 2 * zoom); pen.closePath(); pen.fill();
   }
 }

@@ -12,6 +12,7 @@ const KEYS = [
   ["Esc", "stop whatever is going on"],
   ["Ctrl + Z", "take back the last throwing away, deletion or mark"],
   [",  and  .", "one step back and on in a recording"],
+  ["Tab", "goes to everything else; in the chart, ← → choose and Enter opens"],
   ["Page up / down", "the trial before and after"],
 ];
 
@@ -24,7 +25,7 @@ export function startHelp() {
       h("dt", {}, ...keys.split("  ").filter(Boolean).map((part) => (/^(or|and)$/.test(part) ? ` ${part} ` : h("kbd", {}, part)))),
       h("dd", {}, does),
     ])),
-    h("p", { className: "faint" }, "Too hard? Slow it down under “Speed”: the physics stays the same, only time goes by more slowly. A gamepad works, too: stick to push, A keep, B throw away, X again, Y failed."),
+    h("p", { className: "faint" }, "Too hard? Slow it down under “Speed”: the physics stays the same, only time goes by more slowly. A gamepad works, too: stick to push, A start and keep, B throw away, X again, Y failed, Menu stop."),
     h("form", { method: "dialog" }, h("button", { className: "primary" }, "Close")));
   byId("help").addEventListener("click", () => dialog.showModal());
   for (const menu of document.querySelectorAll("details.menu")) {
@@ -35,15 +36,15 @@ export function startHelp() {
   }
 }
 
-export function fillSaveMenu(formats, state) {
-  const save = (address) => () => { byId("save-menu").open = false; state.fetchFile(address); };
+export function fillSaveMenu(formats, page) {
+  const save = (address) => () => { byId("save-menu").open = false; page.fetchFile(address()); };
   const select = h("select", { id: "format" }, ...formats.map((one) =>
     h("option", { value: one.name }, `${one.name} (${one.suffix})`)));
   byId("save-sheet").replaceChildren(
     h("h3", {}, "The whole session, to look at"),
     h("button", { id: "save-replay", onclick: save(() => "./api/replay") }, "Replay in one HTML file"),
     h("h3", {}, "The run, for every misstep command"),
-    h("button", { id: "save-run", onclick: () => state.saveRun() }, "Run folder (.zip)"),
+    h("button", { id: "save-run", onclick: () => page.saveRun() }, "Run folder (.zip)"),
     h("h3", {}, "Your attempts"),
     h("div", { className: "row" }, select,
       h("button", { id: "save-attempts", onclick: save(() => `./api/download/${select.value}`) }, "Download")));

@@ -39,13 +39,18 @@ export function signed(value, digits = 1) {
   return (value < 0 ? "−" : "+") + text;
 }
 
+// A number with its unit; units that are multiples themselves, such as "500 N", are multiplied.
+export function withUnit(text, column) {
+  const unit = shownUnit(column);
+  if (!unit) return text;
+  return /^\d/.test(unit) ? `${text} × ${unit}` : unit === "°" ? `${text}°` : `${text} ${unit}`;
+}
+
 export function brief(value) {
   if (value === null || value === undefined) return "–";
   const size = Math.abs(value);
-  if (size >= 1000) return value.toFixed(0);
-  if (size >= 100) return value.toFixed(0);
-  if (size >= 1) return value.toFixed(1);
-  return value.toPrecision(2);
+  const text = size >= 100 ? value.toFixed(0) : size >= 1 ? value.toFixed(1) : value.toPrecision(2);
+  return text.replace("-", "−");
 }
 
 export const GLYPHS = { failure: "✕", success: "✓", unknown: "?" };
@@ -72,7 +77,10 @@ export const fontSize = () => parseFloat(getComputedStyle(document.documentEleme
 export function ticks(low, high, count = 5) {
   const rough = (high - low) / count;
   const power = 10 ** Math.floor(Math.log10(rough));
-  const step = [1, 2, 5, 10].map((f) => f * power).find((s) => s >= rough) ?? rough;
+  const steps = [0.5, 1, 2, 5, 10].map((f) => f * power);
+  const within = (step) => Math.floor(high / step + 1e-9) - Math.ceil(low / step - 1e-9) + 1;
+  // The first that is wide enough, or the one before where that leaves a single number.
+  const at = steps.findIndex((step) => step >= rough * (1 - 1e-9)), step = within(steps[at]) < 3 ? steps[at - 1] : steps[at];
   const result = [];
   for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) result.push(k * step);
   return { at: result, digits: Math.max(0, -Math.floor(Math.log10(step) + 1e-9)) };

@@ -1,8 +1,11 @@
 // Hands: keys, touch pads and a gamepad become how far each action is pushed, from −1 to 1.
 
-import { byId } from "misstep/dom.js";
+import { byId, show } from "misstep/dom.js";
 
 const KEYS = { ArrowLeft: [0, -1], a: [0, -1], ArrowRight: [0, 1], d: [0, 1], ArrowDown: [1, -1], s: [1, -1], ArrowUp: [1, 1], w: [1, 1] };
+// Of a gamepad in the standard layout.
+const PAD_CROSS = { 12: [1, 1], 13: [1, -1], 14: [0, -1], 15: [0, 1] };
+const DEAD = 0.12; // of a stick that nobody touches
 const PAD_BUTTONS = { 0: "Enter", 1: "Backspace", 2: "r", 3: "f", 9: "Escape" };
 
 const key = (event) => (event.key.length === 1 ? event.key.toLowerCase() : event.key);
@@ -16,11 +19,20 @@ export class Input {
     this.size = 1;
     this.oneWay = false;
     this.last = "";
+    this.stick = [];
     this.padsBefore = {};
     addEventListener("keydown", (event) => this.keyDown(event));
     addEventListener("keyup", (event) => { if (this.down.delete(key(event))) this.send(event.timeStamp); });
     addEventListener("blur", () => this.release());
-    for (const [id, name] of [["pad-left", "ArrowLeft"], ["pad-right", "ArrowRight"]]) this.pad(byId(id), name);
+    const pads = { "pad-left": "ArrowLeft", "pad-right": "ArrowRight", "pad-up": "ArrowUp", "pad-down": "ArrowDown" };
+    for (const [id, name] of Object.entries(pads)) this.pad(byId(id), name);
+  }
+
+  use(system) {
+    this.size = system.actions.length;
+    this.oneWay = system.one_way;
+    show(byId("pad-left"), !this.oneWay);
+    for (const id of ["pad-up", "pad-down"]) show(byId(id), this.size > 1);
   }
 
   keyDown(event) {
@@ -59,16 +71,15 @@ export class Input {
 
   // Look at the gamepads; to be called once a frame.
   poll(now) {
-    const pad = navigator.getGamepads?.().find((one) => one?.connected);
-    if (!pad) return;
-    const stick = pad.axes.slice(0, this.size).map((value) => (Math.abs(value) < 0.12 ? 0 : value));
-    if (pad.buttons[14]?.pressed) stick[0] = -1;
-    if (pad.buttons[15]?.pressed) stick[0] = 1;
-    this.stick = stick.some((value) => value) ? stick : null;
+    const pad = [...(navigator.getGamepads?.() ?? [])].find((one) => one?.connected);
+    const isDown = (index) => Boolean(pad?.buttons[index]?.pressed);
+    // Axes go to the right and down, actions to the right and up.
+    const stick = (pad?.axes ?? []).slice(0, Math.min(this.size, 4)).map((value, i) => (Math.abs(value) < DEAD ? 0 : i % 2 ? -value : value));
+    for (const [index, [action, sign]] of Object.entries(PAD_CROSS)) if (isDown(index) && action < this.size) stick[action] = sign;
+    this.stick = stick;
     for (const [index, name] of Object.entries(PAD_BUTTONS)) {
-      const isDown = Boolean(pad.buttons[index]?.pressed);
-      if (isDown && !this.padsBefore[index]) this.pressed(name);
-      this.padsBefore[index] = isDown;
+      if (isDown(index) && !this.padsBefore[index] && !document.querySelector("dialog[open]")) this.pressed(name);
+      this.padsBefore[index] = isDown(index);
     }
     this.send(now);
   }
@@ -80,7 +91,7 @@ export class Input {
       if (index < this.size) result[index] += sign;
       else if (this.oneWay) result[0] += sign;
     }
-    this.stick?.forEach((value, i) => { result[i] += value; });
+    this.stick.forEach((value, i) => { result[i] += value; });
     return result.map((value) => Math.round(Math.max(-1, Math.min(1, value)) * 100) / 100);
   }
 

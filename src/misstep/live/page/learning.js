@@ -1,6 +1,6 @@
 // The panel of learning: which learner, its options, and the plain sentences.
 
-import { byId, h, nameOf, setText, shownUnit, signed } from "misstep/dom.js";
+import { byId, h, nameOf, setText, show, signed, withUnit } from "misstep/dom.js";
 
 const RUNGS = [
   "Rung 0 · is told nothing more",
@@ -41,20 +41,25 @@ export class LearningPanel {
 
   // Which columns the policy may see, unless somebody has chosen: all where the dynamics are learned.
   suggest() {
-    if (!this.suggested || this.touched) return;
+    if (!this.suggested) return;
     const all = this.learner?.rung >= 4;
-    for (const box of document.querySelectorAll("#columns input")) box.checked = all || this.suggested.includes(box.value);
+    for (const box of document.querySelectorAll("#columns input")) {
+      if (!this.touched) box.checked = all || this.suggested.includes(box.value);
+      if (box.disabled) box.checked = false;
+    }
   }
 
   sees() {
     const boxes = [...document.querySelectorAll("#columns input")], chosen = boxes.filter((box) => box.checked);
     if (!chosen.length || chosen.length === boxes.length) return "";
-    return `, and sees ${chosen.map((box) => box.dataset.name).join(" and ")} alone`;
+    const named = (some) => some.map((box) => box.dataset.name).join(" and ");
+    const others = boxes.filter((box) => !box.checked);
+    return chosen.length <= others.length ? `, and sees ${named(chosen)} alone` : `, and sees all but ${named(others)}`;
   }
 
   // Columns, number of trials, seed, and the runs that are kept; rebuilt only when they change.
   options(session) {
-    const told = JSON.stringify([session.system.name, session.runs, session.mode === "learning"]);
+    const told = JSON.stringify([session.system.name, session.runs, session.still]);
     if (told === this.before) return;
     const same = this.system === session.system.name;
     const chosen = [...document.querySelectorAll("#columns input:checked")].map((box) => box.value);
@@ -65,8 +70,8 @@ export class LearningPanel {
     this.system = session.system.name;
     const columns = session.system.columns.map((column) => h("label", {},
       h("input", { type: "checkbox", value: column.name, checked: chosen.includes(column.name),
-        "data-name": nameOf(column), onchange: () => { this.touched = true; this.explain(); } }),
-      `${nameOf(column)} (${column.name})`));
+        disabled: session.still.includes(column.name), "data-name": nameOf(column), onchange: () => { this.touched = true; this.explain(); } }),
+      `${nameOf(column)} (${column.name})${session.still.includes(column.name) ? ": it never varied" : ""}`));
     const runs = session.runs.map((name) => h("div", { className: "row" },
       h("code", { className: "grow" }, name),
       h("button", { onclick: () => this.ask("open_run", name) }, "Open"),
@@ -97,6 +102,29 @@ export class LearningPanel {
     });
   }
 
+  // At what speed trials are shown, as the server was told; a stroke lasts a tenth of a second.
+  pace(watch, isOneWay) {
+    const usual = isOneWay ? "0.1" : "1", select = byId("playback");
+    if (!watch) select.value = "full";
+    else if (select.value === "full" || isOneWay !== this.wasOneWay) select.value = usual;
+    this.wasOneWay = isOneWay;
+  }
+
+  // Learn, stop it, or let the policy run: which of them can be pressed now.
+  buttons({ mode, run, drives, fits, attempts }, balanceLabel) {
+    const learning = mode === "learning", reason = fits[byId("learner").value];
+    const learn = byId("learn"), balance = byId("balance");
+    show(learn, !learning);
+    show(byId("halt"), learning);
+    byId("halt").disabled = !drives;
+    learn.disabled = !drives || Boolean(reason) || mode !== "ready";
+    learn.title = reason ?? "";
+    setText(learn, attempts.length && !reason ? `Learn from ${attempts.length}` : "Learn");
+    show(balance, Boolean(run?.trials.length) && !learning);
+    balance.disabled = !drives || !["ready", "balancing"].includes(mode);
+    setText(balance, balanceLabel);
+  }
+
   // What is going on in this very state, at most four times a second, so that it can be read.
   here(now, conditional, action, system) {
     if (now - this.spoken < 250) return;
@@ -106,8 +134,7 @@ export class LearningPanel {
 }
 
 export function sentenceHere(conditional, action, system) {
-  const column = system.actions[0], unit = shownUnit(column);
-  const said = (value) => `${signed(value)} ${unit}`.trim();
+  const said = (value) => withUnit(signed(value), system.actions[0]);
   if (conditional.isFar) return `Nobody has been near this state before; it does ${said(action)}.`;
   const epsilon = `(ε ${conditional.epsilon.toFixed(2)})`;
   const off = Math.abs(action - conditional.mean) / (conditional.deviation || 1);

@@ -42,16 +42,20 @@ export class Link {
   }
 }
 
+// What the server says against a request; it may be no sentence of ours.
+export async function problemOf(answer) {
+  const told = await answer.json().catch(() => ({}));
+  return told.problem ?? "the server refused";
+}
+
 export async function getJson(address) {
   const answer = await fetch(address);
-  const value = await answer.json();
-  if (!answer.ok) throw new Error(value.problem ?? "the server refused");
-  return value;
+  if (!answer.ok) throw new Error(await problemOf(answer));
+  return answer.json();
 }
 
 export async function upload(file) {
   const answer = await fetch(`./api/upload?name=${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
-  const value = await answer.json().catch(() => ({ problem: "the server refused" }));
-  if (!answer.ok) throw new Error(value.problem ?? "the server refused");
-  return value.added;
+  if (!answer.ok) throw new Error(await problemOf(answer));
+  return (await answer.json()).added;
 }

@@ -98,7 +98,7 @@ export class Plane {
     values.sort((a, b) => a - b);
     const at = (q) => values[Math.min(values.length - 1, Math.floor(q * values.length))];
     let low = values.length ? at(0.004) : -1, high = values.length ? at(0.996) : 1;
-    if (column.unit === "rad" && !values.length) [low, high] = [-30, 30];
+    if (column.unit === "rad" && !values.length) high = -(low = this.system.parameters.fall_angle_deg > 90 ? -180 : -30);
     const margin = Math.max(0.06 * (high - low), 1e-3 * this.unit);
     this.low = low - margin; this.high = high + margin;
     const [down, up] = [this.system.low[0] ?? -1, this.system.high[0] ?? 1];
@@ -134,7 +134,7 @@ export class Plane {
     const unit = shownUnit(column), action = this.system.actions[0];
     pen.fillText(`${nameOf(column)}${unit ? ` [${unit}]` : ""} →`, x0 + w, height - 1);
     pen.textAlign = "left";
-    pen.fillText(`↑ ${nameOf(action)}${action.unit ? ` [${action.unit}]` : ""}`, x0, height - 1);
+    pen.fillText(`↑ ${nameOf(action)}${action.unit ? ` [${shownUnit(action)}]` : ""}`, x0, height - 1);
   }
 
   drawPoints(pen, recordings, colour, radius, stride, square) {
@@ -163,7 +163,8 @@ export class Plane {
     pen.lineWidth = 1.7 * this.zoom;
     pen.stroke();
     const x = this.X(centre[0] * this.unit), y = this.Y(centre[1]);
-    pen.beginPath(); pen.moveTo(x - 4, y); pen.lineTo(x + 4, y); pen.moveTo(x, y - 4); pen.lineTo(x, y + 4);
+    const arm = 4 * this.zoom;
+    pen.beginPath(); pen.moveTo(x - arm, y); pen.lineTo(x + arm, y); pen.moveTo(x, y - arm); pen.lineTo(x, y + arm);
     pen.stroke();
   }
 }

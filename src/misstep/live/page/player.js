@@ -67,11 +67,14 @@ export class Player {
   }
 
   showControls() {
-    setText(byId("play"), this.playing ? "❚❚" : "▶");
+    byId("play").classList.toggle("playing", this.playing);
     const seek = byId("seek");
     const value = String(Math.round((1000 * this.position) / this.duration));
     if (seek.value !== value) seek.value = value;
-    setText(byId("clock"), `${this.position.toFixed(2)} of ${this.duration.toFixed(2)} s`);
+    const clock = `${this.position.toFixed(2)} of ${this.duration.toFixed(2)} s`;
+    if (byId("clock").textContent === clock) return;
+    setText(byId("clock"), clock);
+    seek.setAttribute("aria-valuetext", clock);
   }
 
   // The state between two observations, as it was recorded.
