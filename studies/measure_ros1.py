@@ -2,10 +2,10 @@
 
 Starts a roscore of its own, the exploration node, and a node with two services that do nothing:
 std_srvs/Empty, and one with the exploration service's messages and a constant action. All are
-called over persistent connections, in blocks that take turns, so that a busy machine disturbs all
-alike.
+called over persistent connections, in short blocks that take turns, so that a busy machine disturbs
+all alike. The services that do nothing are rospy's own on both sides, with genpy's messages.
 
-    python studies/measure_ros1.py [--calls 20000] [--learner donut]
+    python studies/measure_ros1.py [--calls 20000] [--learner donut] [--core 0]
 """
 
 import argparse
@@ -23,17 +23,17 @@ import misstep
 from misstep.robot.ros.explorer import NodeExplorer
 from misstep.robot.ros1.bus import Ros1Bus
 from misstep.robot.ros1.environment import import_ros
-from misstep.robot.ros1.services import service_type
+from misstep.robot.ros1.services import generated_type
 from misstep.storage import write_json
 
-BLOCK = 500
+BLOCK = 20
 EMPTY = """
 from misstep.robot.ros1.environment import import_ros, init_node
 rospy = init_node("empty")
 kind = import_ros("std_srvs.srv")
 service = rospy.Service("empty", kind.Empty, lambda request: kind.EmptyResponse())
-from misstep.robot.ros1.services import service_type
-explore = service_type("Explore")
+from misstep.robot.ros1.services import generated_type
+explore = generated_type("Explore")
 answer = explore._response_class(1, 1, 1, (0.5,), (0.5,))
 other = rospy.Service("constant", explore, lambda request: answer)
 rospy.spin()
@@ -46,8 +46,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--calls", type=int, default=20_000)
     parser.add_argument("--learner", default="donut")
+    parser.add_argument("--core", type=int, help="let all processes run on this core")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
+    if arguments.core is not None:
+        os.sched_setaffinity(0, {arguments.core})
     with tempfile.TemporaryDirectory() as name, socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -92,7 +95,7 @@ def measure(calls: int) -> dict[str, float]:
     rospy.wait_for_service("empty", 60)
     empty = rospy.ServiceProxy("empty", empty_type, persistent=True)
     rospy.wait_for_service("constant", 60)
-    constant = rospy.ServiceProxy("constant", service_type("Explore"), persistent=True)
+    constant = rospy.ServiceProxy("constant", generated_type("Explore"), persistent=True)
     explorer = NodeExplorer(bus)
     explorer.start()
     rng = np.random.default_rng(0)

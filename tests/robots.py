@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from misstep.robot.guard import Refusal
 from misstep.robot.limits import Reason
 
 
@@ -78,6 +79,92 @@ class Actuator:
         safe = np.array(self.limits.safe)
         reach = np.array(self.limits.high) - np.array(self.limits.low)
         return bool((np.abs(self.action - safe) <= 1e-8 * reach).all())
+
+
+class PlainAdmission:
+    """What the compiled guard says of states, a second time: word by word, with None for none."""
+
+    def __init__(self, limits, watchdog):
+        self.limits, self.watchdog = limits, watchdog
+        self.clock, self.time = None, 0.0
+        self.last = self.offset = self.fresh_at = None
+
+    def look_at(self, now):
+        """Follow a clock; steps back are no time."""
+        if self.clock is not None:
+            self.time += max(0.0, now - self.clock)
+        self.clock = now
+
+    def begin(self, now):
+        self.look_at(now)
+        self.offset = self.fresh_at = None
+
+    def connect(self):
+        self.last = self.offset = None
+
+    def is_silent(self, now):
+        self.look_at(now)
+        return self.fresh_at is not None and self.time - self.fresh_at > self.watchdog
+
+    def check(self, state, now):
+        """Return whether the robot was silent before, and why the state is refused."""
+        silent = self.is_silent(now)
+        refusal = self.flaw(state) or self.lag(state)
+        if refusal is None:
+            self.last, self.fresh_at = state, self.time
+            if self.offset is None:
+                self.offset = self.time - state.stamp
+        return silent, refusal
+
+    def flaw(self, state):
+        bounds = list(zip(self.limits.observation_low, self.limits.observation_high, strict=True))
+        if len(state.observation) != len(bounds):
+            return Refusal.LENGTH
+        if not all(map(math.isfinite, (state.stamp, state.cost or 0.0, *state.observation))):
+            return Refusal.NOT_FINITE
+        inside = [
+            low <= x <= high for x, (low, high) in zip(state.observation, bounds, strict=True)
+        ]
+        return None if all(inside) else Refusal.RANGE
+
+    def lag(self, state):
+        if self.last is not None and state.sequence <= self.last.sequence:
+            return Refusal.ORDER
+        if self.offset is None:
+            return None
+        age = self.time - state.stamp - self.offset
+        if state.stamp <= self.last.stamp or age > self.watchdog:
+            return Refusal.STALE
+        return Refusal.CLOCK if age < -self.watchdog else None
+
+
+def plain_move(limits, action, slope, wanted, step):
+    """Return the next action and slope: of all slopes that the limits allow, the one nearest to
+    what would arrive. How fast one may be with so much room left is found by bisection."""
+    low, high, rate, jerk = limits.low[0], limits.high[0], limits.rate[0], limits.jerk[0]
+    target = min(max(wanted, low), high)
+    if math.isinf(jerk):
+        reach = rate * step if math.isfinite(rate) else math.inf
+        return min(max(target, action - reach), action + reach), slope
+    if step == 0.0:
+        return action, slope
+
+    def fastest(room):
+        slow, fast = 0.0, room / step
+        for _ in range(200):
+            middle = 0.5 * (slow + fast)
+            can_stop = middle * step + middle**2 / (2.0 * jerk) <= room
+            slow, fast = (middle, fast) if can_stop else (slow, middle)
+        return slow
+
+    way = target - action
+    ideal = way / step
+    if abs(way) > jerk * step * step:
+        ideal = math.copysign(fastest(abs(way)), way)
+    most = min(slope + jerk * step, fastest(high - action))
+    least = max(slope - jerk * step, -fastest(action - low))
+    now = max(min(max(min(ideal, rate), -rate), most), least)
+    return min(max(action + now * step, low), high), now
 
 
 class Scripted:

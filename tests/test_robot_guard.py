@@ -12,10 +12,12 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
-from robots import NASTY, Actuator
+from robots import NASTY, Actuator, PlainAdmission, plain_move
 
+from misstep.errors import MisstepError
 from misstep.robot.guard import Guard, Refusal, Safety, State
-from misstep.robot.limits import Limiter, Limits, Reason
+from misstep.robot.limiter import Limiter
+from misstep.robot.limits import Limits, Reason
 from misstep.systems import Judged
 
 PERIOD = 0.02
@@ -97,6 +99,43 @@ def test_the_limiter_keeps_value_rate_and_jerk(limits, rate, jerk, moves):
             assert abs(change - slope * passed) <= jerk * passed**2 + 1e-9
             slope = change / passed
         action = limiter.action[0]
+
+
+@settings(max_examples=200)
+@given(
+    rate=SIZES | st.just(math.inf),
+    jerk=st.floats(1.0, 1e5) | st.just(math.inf),
+    moves=st.lists(
+        st.tuples(st.floats(-30.0, 30.0), st.sampled_from([0.0, 1e-3, 0.013, PERIOD])), max_size=40
+    ),
+)
+def test_the_compiled_limiter_moves_as_the_plain_one(limits, rate, jerk, moves):
+    limits = replace(limits, rate=(rate,), jerk=(jerk,), safe=(3.0,))
+    limiter = Limiter(limits)
+    action, slope = 3.0, 0.0
+    for wanted, elapsed in moves:
+        limiter.move([wanted], elapsed)
+        action, slope = plain_move(limits, action, slope, wanted, elapsed)
+        assert limiter.action[0] == pytest.approx(action, rel=1e-6, abs=1e-6)
+
+
+def test_each_action_has_limits_of_its_own(limits):
+    column = limits.action_columns[0]
+    both = replace(
+        limits, action_columns=(column, replace(column, name="other")), low=(-20.0, -1.0),
+        high=(20.0, 1.0), rate=(50.0, math.inf), jerk=(math.inf, 1e3), safe=(0.0, 0.5),
+    )  # fmt: skip
+    limiter, ones = Limiter(both), [Limiter(_only(both, i)) for i in range(2)]
+    for row in np.random.default_rng(1).normal(0.0, [20.0, 1.0], (100, 2)):
+        reason = limiter.move(row, PERIOD)
+        alone = [one.move([wanted], PERIOD) for one, wanted in zip(ones, row, strict=True)]
+        assert limiter.action == ones[0].action + ones[1].action
+        assert reason == alone[0] | alone[1]
+
+
+def _only(limits, i):
+    names = ("action_columns", "low", "high", "rate", "jerk", "safe")
+    return replace(limits, **{name: (getattr(limits, name)[i],) for name in names})
 
 
 @settings(max_examples=50)
@@ -277,35 +316,61 @@ class AnyOrder(RuleBasedStateMachine):
         limits = replace(self.made, rate=(rate,), jerk=(jerk,), safe=(safe,))
         self.guard = Guard(limits, Safety(dry_run=dry_run))
         self.actuator = Actuator(limits, dry_run)
+        self.plain = PlainAdmission(limits, SAFETY.watchdog)
         self.now, self.sequence, self.stopped = 100.0, 0, False
-        self.accepted = []
 
     @rule(wait=WAITS)
     def wait(self, wait):
         self.now += wait
         self.actuator.look_at(self.now)
 
+    @rule(wanted=st.sampled_from([math.nan, math.inf, -math.inf]), took=WAITS)
+    def policy_answers_nonsense(self, wanted, took):
+        asked = self.now
+        self.now += took
+        if self.stopped:
+            self.check(self.guard.send((wanted,), self.now, asked))
+            return
+        with pytest.raises(MisstepError, match="its action is"):
+            self.guard.send((wanted,), self.now, asked)
+        command = self.guard.keep_on(self.now)  # and goes on
+        assert not command.reason & Reason.POLICY
+        self.check(command)
+
     @rule()
     def begin_trial(self):
         self.guard.begin(self.now)
+        self.plain.begin(self.now)
+
+    @rule()
+    def connect(self):
+        self.guard.connect()
+        self.plain.connect()
+        self.sequence = 0
 
     @rule(row=ROWS, ahead=st.integers(-2, 3), stamp=NUMBERS | st.just(None))
     def state_comes(self, row, ahead, stamp):
         self.sequence += ahead
         stamp = self.now if stamp is None else stamp
-        refusal = self.guard.check(State(self.sequence, stamp, tuple(row)), self.now)
+        state = State(self.sequence, stamp, tuple(row))
+        silent, refusal = self.plain.check(state, self.now)
+        assert self.guard.check(state, self.now) == refusal
+        assert self.guard.was_silent == silent
         if refusal is None:
-            assert len(row) == 4
+            np.testing.assert_array_equal(self.guard.observation, row)
             assert np.isfinite([*row, stamp]).all()
             assert abs(row[0]) <= 2.0
             assert abs(row[2]) <= np.pi
-            assert self.sequence > max(self.accepted, default=-math.inf)
-            self.accepted.append(self.sequence)
+
+    @rule()
+    def somebody_looks_at_the_watchdog(self):
+        assert self.guard.is_silent(self.now) == self.plain.is_silent(self.now)
 
     @rule(wanted=st.floats(allow_nan=False, allow_infinity=False), took=WAITS)
     def policy_answers(self, wanted, took):
         asked = self.now
         self.now += took
+        self.plain.look_at(self.now)
         command = self.guard.send((wanted,), self.now, asked)
         if took > PERIOD:
             assert not command.reason & Reason.POLICY
@@ -343,6 +408,7 @@ class AnyOrder(RuleBasedStateMachine):
         raise AssertionError("the safe action was never reached")
 
     def check(self, command):
+        self.plain.look_at(self.now)
         self.actuator.obey(command, self.now)
         assert bool(command.reason & Reason.STOP) == self.stopped
 

@@ -496,9 +496,33 @@ def test_a_log_that_was_cut_is_read_as_far_as_it_goes(tmp_path):
         else:
             assert read == expected[: len(read)]
             assert len(expected) - len(read) == 4 - sum(length >= end for end in _ends(whole))
-    path.write_bytes(whole[:-3] + bytes(60))
-    with pytest.raises(MisstepError, match="damaged at byte"):
-        list(read_log(path)[1])
+    for garbage in (b"\7" + bytes(60), bytes(2**17) + b"\7"):
+        path.write_bytes(whole + garbage)
+        with pytest.raises(MisstepError, match="damaged at byte"):
+            list(read_log(path)[1])
+
+
+def test_what_a_killed_service_leaves_is_whole_records(tmp_path):
+    """At any moment: the file as it is then, never closed."""
+    path = tmp_path / "a.log"
+    log = ActionLog(path, {"n_observations": 2, "n_actions": 1})
+    written = []
+    for i in range(8000):  # through two ends of what is mapped
+        assert log.reserve()
+        log.command(float(i), Command((1.0,), (2.0,), 3, i, i), (0.1, 0.2))
+        written.append(i)
+        if i % 1000 == 999:
+            log.event(float(i), "x" * i)
+            assert [r.sequence for r in read_log(path)[1] if isinstance(r, Sent)] == written
+    left = path.read_bytes()
+    records = list(read_log(path)[1])
+    log.close()
+    assert list(read_log(path)[1]) == records
+    assert left.startswith(path.read_bytes())
+    # A record whose head was not yet written when the kill came is none.
+    whole = path.read_bytes()
+    path.write_bytes(whole + bytes(4) + b"half a body" + bytes(3000))
+    assert list(read_log(path)[1]) == records
 
 
 def _ends(log):
@@ -529,24 +553,49 @@ def full_disk():
 
 
 def test_what_cannot_be_logged_is_not_sent(served, scripted, full_disk, tmp_path):
-    service, robot = served(folder="run")
+    service, robot = served(folder="run", duration=1000.0)
     robot.start()
     scripted.answer = np.array([3.0])
     assert robot.report().action == (3.0,)
     log = tmp_path / "run" / LOGS / "0000.log"
-    full_disk(log.stat().st_size + 100)
-    commands = [robot.report() for _ in range(5)]
-    assert [command.action for command in commands][-2:] == [(0.0,), (0.0,)]
+    full_disk(log.stat().st_size)  # what is reserved remains
+    commands = []
+    while not service.stopped:
+        commands.append(robot.report())
+    assert {command.action for command in commands} == {(3.0,), (0.0,)}
     assert commands[-1].reason & Reason.STOP
-    assert service.status()["unlogged"] > 0
+    assert commands[-1].action == (0.0,)
     full_disk(resource.RLIM_INFINITY)
     service.clear("a person")
     assert robot.start().number == 0
     assert robot.report().action == (0.0,)
     scripted.answer = np.array([4.0])
     assert robot.report().action == (4.0,)
-    records = list(read_log(log)[1])  # nothing half between the whole ones
-    assert [r.action for r in records if isinstance(r, Sent)][-1] == (4.0,)
+    assert service.status()["unlogged"] == 0
+    records = list(read_log(log)[1])
+    sent = [r.action for r in records if isinstance(r, Sent)]
+    assert sent == [(3.0,), *(command.action for command in commands), (0.0,), (4.0,)]
+    assert "the disk has no room for the log" in [r.text for r in records if isinstance(r, Event)]
+
+
+def test_a_disk_that_stays_full_lets_nothing_but_safe_actions_out(
+    served, scripted, full_disk, tmp_path
+):
+    service, robot = served(folder="run", duration=1000.0)
+    robot.start()
+    scripted.answer = np.array([3.0])
+    log = tmp_path / "run" / LOGS / "0000.log"
+    full_disk(log.stat().st_size)
+    while not service.stopped:
+        robot.report()
+    while service.status()["unlogged"] < 3:
+        assert robot.report().action == (0.0,)
+    service.clear("a person")  # in vain
+    assert robot.report().action == (0.0,)
+    assert service.stopped
+    full_disk(resource.RLIM_INFINITY)
+    assert robot.report().action == (0.0,)
+    assert [r.action for r in read_log(log)[1] if isinstance(r, Sent)][-1] == (0.0,)
 
 
 def test_a_finished_trial_outlives_a_full_disk(served, full_disk, tmp_path):

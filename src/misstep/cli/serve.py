@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from misstep.cli.interruption import resumable
 from misstep.cli.options import (
     Cost,
     Failure,
@@ -131,6 +132,7 @@ def serve(
     from misstep.robot.guard import Safety
     from misstep.robot.limits import Limits
     from misstep.robot.service import ExplorationService
+    from misstep.runs import CONFIG
 
     check_output_file(json, "--json")
     safety = Safety(watchdog_ms / 1e3, deadline_ms / 1e3, dry_run)
@@ -157,7 +159,8 @@ def serve(
         safe=_numbers("--safe", safe),
         ranges=_ranges(range_),
     )
-    with kept_in(run, folder if run.folder is None else None):
+    new = folder if run.folder is None else None
+    with resumable(folder, CONFIG, "serve"), kept_in(run, new):
         service = ExplorationService(
             run,
             system=robot,

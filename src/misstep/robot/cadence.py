@@ -25,9 +25,11 @@ class Cadence:
     def add(self, seconds: float) -> None:
         """Count a duration."""
         self.n += 1
-        self.longest = max(self.longest, seconds)
-        octaves = math.log2(max(seconds, _SHORTEST) / _SHORTEST)
-        self._counts[min(int(octaves * _PER_OCTAVE), _BINS - 1)] += 1
+        if seconds > self.longest:
+            self.longest = seconds
+        octaves = math.log2(seconds / _SHORTEST) if seconds > _SHORTEST else 0.0
+        index = int(octaves * _PER_OCTAVE)
+        self._counts[index if index < _BINS else -1] += 1
 
     def quantile(self, q: float) -> float | None:
         """Return a duration [s] that the share `q` did not exceed, to a bin; None before any."""

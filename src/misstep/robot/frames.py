@@ -25,7 +25,11 @@ class FrameStream:
 
     def send(self, message: bytes) -> None:
         """Send a message; raise OSError if that fails."""
-        self._socket.sendall(_LENGTH.pack(len(message)) + message)
+        self.send_raw(_LENGTH.pack(len(message)) + message)
+
+    def send_raw(self, data: bytes) -> None:
+        """Send bytes that say their length by themselves; raise OSError if that fails."""
+        self._socket.sendall(data)
 
     def receive(self) -> bytes | None:
         """Return the next message; None if the stream has ended, also in the middle of one.

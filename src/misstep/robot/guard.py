@@ -21,17 +21,24 @@ Time is handed in with every call, in seconds of any clock. A clock that jumps b
 that stood still.
 """
 
-import math
 from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from misstep.errors import MisstepError
 from misstep.parameters import check_parameters, parameter
-from misstep.robot.limits import Limiter, Limits, Reason, Row
+from misstep.robot import reckoning
+from misstep.robot.limiter import ACTION, SLOPE, WANTED
+from misstep.robot.limits import Limits, Reason, Row
 
 _AT_REST = 1e-9  # of the action's range
+# Plain numbers for what happens a thousand times a second: enumerations are ten times as slow.
 _NO_TRIAL = int(Reason.IDLE | Reason.WATCHDOG | Reason.STOP)
+_SILENT, _admit, _follow = reckoning.SILENT, reckoning.admit, reckoning.follow
 _POLICY, _STOP, _DRY_RUN = int(Reason.POLICY), int(Reason.STOP), int(Reason.DRY_RUN)
 
 
@@ -44,6 +51,16 @@ class Refusal(StrEnum):
     ORDER = "out of order"
     STALE = "stale"
     CLOCK = "from the future"
+
+
+_REFUSALS = {
+    reckoning.LENGTH: Refusal.LENGTH,
+    reckoning.NOT_FINITE: Refusal.NOT_FINITE,
+    reckoning.RANGE: Refusal.RANGE,
+    reckoning.ORDER: Refusal.ORDER,
+    reckoning.STALE: Refusal.STALE,
+    reckoning.FUTURE: Refusal.CLOCK,
+}
 
 
 class State(NamedTuple):
@@ -120,96 +137,109 @@ class Guard:
         How many states were refused, by why.
     late : int
         How many actions missed the deadline.
+    was_silent : bool
+        Whether there had been no fresh state for longer than the watchdog waits when the last
+        state came.
+    observation : ndarray, shape (n,)
+        Of the last fresh state; for whoever takes it to keep.
     """
 
     def __init__(self, limits: Limits, safety: Safety) -> None:
         self.limits = limits
         self.deadline = safety.deadline or limits.period
-        self.stopped = False
+        self.stopped = self.was_silent = False
         self.refused: Counter[Refusal] = Counter()
         self.late = 0
-        self._watchdog, self._dry_run = safety.watchdog, safety.dry_run
-        self._limiter = Limiter(limits)
-        self._ranges = tuple(zip(limits.observation_low, limits.observation_high, strict=True))
+        self.observation: NDArray[np.float64] = np.zeros(0)
+        self._dry_run = safety.dry_run
+        self._vector = reckoning.new_vector(limits, safety.watchdog)
+        table = reckoning.table_in(self._vector)
+        self._action, self._slope, self._wanted = table[ACTION], table[SLOPE], table[WANTED]
         self._tolerance = [
             _AT_REST * (high - low) for low, high in zip(limits.low, limits.high, strict=True)
         ]
-        self._clock: float | None = None  # as last handed in
-        self._time = 0.0  # the same, without steps back
-        self._sent_at: float | None = None
-        self._last: State | None = None
-        self._offset: float | None = None  # from the robot's clock to ours
-        self._fresh_at: float | None = None  # since the beginning of the trial
+        self._sequence: int | None = None  # of the last fresh state
         self._sent = limits.safe
         self._n_sent = 0
         self._answering = -1
-        self._target: Row = limits.safe
         self._why = int(Reason.IDLE)
 
     def begin(self, now: float) -> None:
         """Begin a trial: its first state starts the watchdog, and sets the robot's clock."""
-        self._advance(now)
-        self._offset = None
-        self._fresh_at = None
-        self._target, self._why = self.limits.safe, int(Reason.IDLE)
+        reckoning.advance(self._vector, now)
+        self._vector[[reckoning.OFFSET, reckoning.FRESH_AT]] = np.nan
+        self.retreat(Reason.IDLE)
 
     def connect(self) -> None:
         """Take it that states are counted anew from here on."""
-        self._last = None
-        self._offset = None
+        self._sequence = None
+        self._vector[reckoning.OFFSET] = np.nan
         self._answering = -1
 
     def retreat(self, why: Reason) -> None:
         """Go towards the safe action from now on, until a policy's action is sent again."""
-        self._target, self._why = self.limits.safe, int(why)
+        self._wanted[:], self._why = self.limits.safe, int(why)
 
     def check(self, state: State, now: float) -> Refusal | None:
         """Return why a state is refused, and count it; None if it can be true and is fresh."""
-        self._advance(now)
-        self._answering = state.sequence
-        refusal = self._flaw(state) or self._lag(state)
-        if refusal is not None:
-            self.refused[refusal] += 1
-            return refusal
-        self._last = state
-        if self._offset is None:
-            self._offset = self._time - state.stamp
-        self._fresh_at = self._time
-        return None
+        sequence, stamp, row, cost = state[:4]
+        last, self._answering = self._sequence, sequence
+        observation = np.array(row, dtype=np.float64)
+        in_order = last is None or sequence > last
+        answer = _admit(self._vector, observation, in_order, stamp, cost or 0.0, now)
+        self.was_silent = answer >= _SILENT
+        if answer == 0 or answer == _SILENT:
+            self._sequence, self.observation = sequence, observation
+            return None
+        refusal = _REFUSALS[answer & ~_SILENT]
+        self.refused[refusal] += 1
+        return refusal
 
     def is_silent(self, now: float) -> bool:
         """Return whether there has been no fresh state for longer than the watchdog waits."""
-        self._advance(now)
-        return self._fresh_at is not None and self._time - self._fresh_at > self._watchdog
+        silent: bool = reckoning.is_silent(self._vector, now)
+        return silent
 
-    def send(self, wanted: Row, now: float, asked: float) -> Command:
-        """Return the command for a policy's action, (m,) finite, to a state that came at `asked`.
+    def send(self, wanted: ArrayLike, now: float, asked: float) -> Command:
+        """Return the command for a policy's action, (m,), to a state that came at `asked`.
 
         A policy that missed the deadline is not followed.
+
+        Raises
+        ------
+        MisstepError
+            If it is not finite; nothing has been sent.
         """
         if self.stopped:
             return self.keep_on(now)
+        self._wanted[:], self._why = wanted, _POLICY
         if now - asked > self.deadline:
             self.late += 1
-            self.retreat(Reason.LATE)
-        else:
-            self._target, self._why = wanted, _POLICY
+            if np.isfinite(self._wanted).all():
+                self.retreat(Reason.LATE)
         return self.keep_on(now)
 
     def keep_on(self, now: float, why: int = 0) -> Command:
         """Return the command where there is nothing new: on towards what was wanted before."""
-        self._advance(now)
-        sent_at, self._sent_at = self._sent_at, self._time
         if self.stopped:
-            self._limiter.jump(self.limits.safe)
-            return self._command(_STOP | why)
-        elapsed = self.limits.period if sent_at is None else self._time - sent_at
-        return self._command(self._why | why | self._limiter.move(self._target, elapsed))
+            self._jump()
+        reason = _follow(self._vector, now)
+        if reason < 0:
+            flaw = f"its action is {tuple(self._wanted.tolist())}"
+            self.retreat(Reason.IDLE)
+            raise MisstepError(flaw)
+        intended = sent = tuple(self._action.tolist())
+        why |= _STOP if self.stopped else self._why | reason
+        if self._dry_run:
+            sent, why = self.limits.safe, why | _DRY_RUN
+        self._sent = sent
+        self._n_sent = number = self._n_sent + 1
+        return Command(sent, intended, why, self._answering, number)
 
     def stop(self) -> None:
         """Stop: every command is the safe action, until `clear`."""
         self.stopped = True
-        self._limiter.jump(self.limits.safe)
+        self._jump()
         self.retreat(Reason.IDLE)
 
     def clear(self) -> None:
@@ -222,41 +252,6 @@ class Guard:
         sent = zip(self._sent, self.limits.safe, self._tolerance, strict=True)
         return all(abs(action - safe) <= near for action, safe, near in sent)
 
-    def _advance(self, now: float) -> None:
-        if self._clock is not None:
-            self._time += max(0.0, now - self._clock)
-        self._clock = now
-
-    def _flaw(self, state: State) -> Refusal | None:
-        """Return what is wrong with a state by itself."""
-        if len(state.observation) != len(self._ranges):
-            return Refusal.LENGTH
-        if not all(map(math.isfinite, (state.stamp, state.cost or 0.0, *state.observation))):
-            return Refusal.NOT_FINITE
-        for value, (low, high) in zip(state.observation, self._ranges, strict=True):
-            if not low <= value <= high:
-                return Refusal.RANGE
-        return None
-
-    def _lag(self, state: State) -> Refusal | None:
-        """Return what is wrong with the time of a state."""
-        if self._last is not None:
-            if state.sequence <= self._last.sequence:
-                return Refusal.ORDER
-            if state.stamp <= self._last.stamp and self._offset is not None:
-                return Refusal.STALE
-        if self._offset is None:
-            return None
-        age = self._time - state.stamp - self._offset
-        if age > self._watchdog:
-            return Refusal.STALE
-        return Refusal.CLOCK if age < -self._watchdog else None
-
-    def _command(self, reason: int) -> Command:
-        intended = tuple(self._limiter.action)
-        self._sent = intended
-        if self._dry_run:
-            self._sent = self.limits.safe
-            reason |= _DRY_RUN
-        self._n_sent += 1
-        return Command(self._sent, intended, reason, self._answering, self._n_sent)
+    def _jump(self) -> None:
+        """Be at the safe action at once, at rest, whatever the limits of rate and jerk."""
+        self._action[:], self._slope[:] = self.limits.safe, 0.0

@@ -1,17 +1,4 @@
-"""What a robot may be told and what it can have measured: limits, and an action that obeys them.
-
-The `Limiter` moves the action from where it is towards where it is wanted, so that at every command
-
-- value: ``low <= a <= high``;
-- rate: ``|a - a'| <= rate * h``, where a' is the action before;
-- jerk: ``|v - v'| <= jerk * h``, where ``v = (a - a') / h`` is the rate of change;
-
-and h is the time since the command before, but never more than one control period. An action that
-changes fast cannot stop at once where jerk is limited, so it has to slow down in time: braking
-from the rate v takes at most ``v² / (2 jerk)``, in steps of whatever length, and the limiter only
-takes a rate that leaves so much room before the limit of the value. From there, slowing down is
-always within all three limits at once.
-"""
+"""What a robot may be told, what it can have measured, and why an action is what it is."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -53,10 +40,6 @@ class Reason(IntFlag):
     """The safe action, in place of what would have been sent."""
     SILENT = 1024
     """Said by a client to itself: the service did not answer in time."""
-
-
-# Plain numbers for what happens a thousand times a second: enumerations are ten times as slow.
-_VALUE, _RATE, _JERK = int(Reason.VALUE), int(Reason.RATE), int(Reason.JERK)
 
 
 @dataclass(frozen=True)
@@ -166,93 +149,6 @@ class Limits:
             tuple(low),
             tuple(high),
         )
-
-
-class Limiter:
-    """Moves the action towards what is wanted, within the limits of value, rate and jerk.
-
-    Plain numbers rather than arrays: an action has one or a few.
-
-    Parameters
-    ----------
-    limits : Limits
-
-    Attributes
-    ----------
-    action : list of m float
-        The one sent last; the safe one at first.
-    rate : list of m float
-        How fast it was changing then, unit/s.
-    """
-
-    def __init__(self, limits: Limits) -> None:
-        self._limits = limits
-        self._bounds = tuple(zip(limits.low, limits.high, limits.rate, limits.jerk, strict=True))
-        self.action = list(limits.safe)
-        self.rate = [0.0] * len(limits.safe)
-
-    def move(self, wanted: Sequence[float], elapsed: float) -> int:
-        """Move the action towards `wanted` and return what held it up, as bits of `Reason`.
-
-        Parameters
-        ----------
-        wanted : sequence of m float
-            Finite.
-        elapsed : float, s
-            Since the command before; anything below 0 counts as 0.
-        """
-        step = min(max(elapsed, 0.0), self._limits.period)
-        reason = 0
-        for i, (low, high, rate, jerk) in enumerate(self._bounds):
-            target = min(max(wanted[i], low), high)
-            if target != wanted[i]:
-                reason |= _VALUE
-            if jerk < math.inf:
-                reason |= self._move_smoothly(i, target, step)
-            elif rate < math.inf:
-                reason |= self._move_steadily(i, target, step)
-            else:
-                self.action[i] = target
-        return reason
-
-    def jump(self, action: Sequence[float]) -> None:
-        """Be at `action` at once, at rest, whatever the limits of rate and jerk."""
-        self.action = list(action)
-        self.rate = [0.0] * len(self.action)
-
-    def _move_steadily(self, i: int, target: float, step: float) -> int:
-        reach = self._bounds[i][2] * step
-        here = self.action[i]
-        self.action[i] = min(max(target, here - reach), here + reach)
-        return 0 if self.action[i] == target else _RATE
-
-    def _move_smoothly(self, i: int, target: float, step: float) -> int:
-        low, high, rate, jerk = self._bounds[i]
-        here, before = self.action[i], self.rate[i]
-        if step == 0.0:
-            return 0 if here == target else _JERK
-        way = target - here
-        # Near enough to be at rest one step after the arrival; else braking in time to arrive.
-        arrives = abs(way) <= jerk * step * step
-        wanted = way / step
-        if not arrives:
-            wanted = math.copysign(_braking_rate(abs(way), step, jerk), way)
-        most = min(before + jerk * step, _braking_rate(high - here, step, jerk))
-        least = max(before - jerk * step, -_braking_rate(here - low, step, jerk))
-        now = min(max(wanted, -rate), rate)
-        reason = _RATE if now != wanted else 0
-        if not least <= now <= most:
-            now = max(min(now, most), least)
-            reason |= _JERK
-        at_target = arrives and now == wanted
-        self.action[i] = target if at_target else min(max(here + now * step, low), high)
-        self.rate[i] = now
-        return reason
-
-
-def _braking_rate(room: float, step: float, jerk: float) -> float:
-    """Return the rate v with v h + v² / (2 jerk) = room: one step, and room enough to brake."""
-    return 2.0 * room / (math.sqrt(step * step + 2.0 * room / jerk) + step)
 
 
 def _row(values: PerColumn, m: int, what: str) -> Row:

@@ -1,9 +1,13 @@
 """A log that says afterwards why each action was sent.
 
 One append-only file a service, of small binary records: a state, the policy's action and the one
-sent, with the reasons, for every command; a line of text for every event between them. A record
-is handed to the operating system before its action leaves, so it outlives the process; a disk that
-is full keeps whole records alone.
+sent, with the reasons, for every command; a line of text for every event between them.
+
+The end of the file is mapped into memory. A record is therefore with the operating system, and
+outlives the process, as soon as it is written, which takes a microsecond and no system call; its
+first four bytes are written last, so that what a kill leaves is whole records and then zeros. The
+room is reserved on the disk ahead: a disk that is full is found out while there is still room to
+say so.
 
 ===========  ====================================================================================
 part         layout, little-endian
@@ -12,6 +16,7 @@ file         ``MISSTEP1``, then a u32 and so many bytes of JSON: columns, limits
 every record u8 kind, u8 0, u16 length of what follows these 4 bytes
 kind 1       u16 reasons, u64 sequence, f64 time [s]; f64 observation (n), intended (m), sent (m)
 kind 2       f64 time [s], then text in UTF-8
+kind 0       the end
 ===========  ====================================================================================
 """
 
@@ -33,7 +38,10 @@ _HEAD = struct.Struct("<BBH")
 _COMMAND, _EVENT = 1, 2
 _TIME = struct.Struct("<d")
 _LONGEST_TEXT = 2000
+_LONGEST_RECORD = _HEAD.size + 2**16
 _NO_SEQUENCE = 2**64 - 1
+_WINDOW = 2**18
+"""Bytes that are mapped; the next are reserved when half of them are full."""
 
 
 class Sent(NamedTuple):
@@ -90,62 +98,99 @@ class ActionLog:
     def __init__(self, path: str | os.PathLike[str], header: Mapping[str, Any]) -> None:
         self.path = Path(path)
         n, m = header["n_observations"], header["n_actions"]
-        self._record = struct.Struct(f"<BBHHQd{n + 2 * m}d")
+        record = struct.Struct(f"<HQd{n + 2 * m}d")
+        self._pack, self._length = record.pack_into, record.size
+        self._command_head = _HEAD.pack(_COMMAND, 0, record.size)
         self._unknown = (float("nan"),) * n
+        self._base = self._at = 0
         text = json.dumps(header).encode()
+        start = _MAGIC + struct.pack("<I", len(text)) + text
         try:
-            flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_EXCL
+            flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
             self._file = os.open(self.path, flags, 0o644)
-            self._size = 0
-            self._append(_MAGIC + struct.pack("<I", len(text)) + text)
+            os.write(self._file, start)
+            self._map(len(start))
         except OSError as error:
             raise MisstepError(f"cannot write the log {path}: {error.strerror}") from error
 
+    def reserve(self) -> bool:
+        """Have room for what comes next; return whether there is plenty.
+
+        Where there is none on the disk, some more records can still be written.
+        """
+        if self._at <= _WINDOW // 2:
+            return True
+        old = self._window
+        try:
+            self._map(self._base + self._at)
+        except OSError:
+            return False
+        old.close()
+        return True
+
     def command(self, time: float, command: Command, observation: Row | None) -> None:
-        """Append a command; raise OSError where the disk refuses."""
-        sequence = command.sequence if command.sequence >= 0 else _NO_SEQUENCE
-        observed = self._unknown if observation is None else observation
-        length = self._record.size - _HEAD.size
-        self._append(
-            self._record.pack(
-                _COMMAND,
-                0,
-                length,
-                command.reason,
-                sequence,
-                time,
-                *observed,
-                *command.intended,
-                *command.action,
-            )
+        """Append a command; raise OSError where there is no room left."""
+        action, intended, reason, sequence, _ = command
+        start = self._at + _HEAD.size
+        end = start + self._length
+        if end > _WINDOW:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        self._pack(
+            self._window,
+            start,
+            reason,
+            sequence if sequence >= 0 else _NO_SEQUENCE,
+            time,
+            *(self._unknown if observation is None else observation),
+            *intended,
+            *action,
         )
+        self._window[self._at : start] = self._command_head
+        self._at = end
 
     def event(self, time: float, text: str) -> None:
-        """Append a line of text; raise OSError where the disk refuses."""
-        line = text.encode()[:_LONGEST_TEXT]
-        self._append(_HEAD.pack(_EVENT, 0, _TIME.size + len(line)) + _TIME.pack(time) + line)
+        """Append a line of text; raise OSError where there is no room left."""
+        line = _TIME.pack(time) + text.encode()[:_LONGEST_TEXT]
+        start = self._at + _HEAD.size
+        end = start + len(line)
+        if end > _WINDOW:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        self._window[start:end] = line
+        self._window[self._at : start] = _HEAD.pack(_EVENT, 0, len(line))
+        self._at = end
 
     def close(self) -> None:
-        """Bring the file onto the disk and close it.
+        """Bring the file onto the disk, without the room that was not needed, and close it.
 
         Raises
         ------
         MisstepError
             If the disk refuses.
         """
+        self._window.close()
         try:
+            os.ftruncate(self._file, self._base + self._at)
             os.fsync(self._file)
         except OSError as error:
             raise MisstepError(f"cannot write the log {self.path}: {error.strerror}") from error
         finally:
             os.close(self._file)
 
-    def _append(self, record: bytes) -> None:
-        written = os.write(self._file, record)
-        if written < len(record):  # the disk is full: half a record would hide those after it
-            os.ftruncate(self._file, self._size)
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        self._size += written
+    def _map(self, end: int) -> None:
+        """Reserve and map a window in which the file ends at `end`."""
+        base = end - end % mmap.ALLOCATIONGRANULARITY
+        _allocate(self._file, base, _WINDOW)
+        self._window = mmap.mmap(self._file, _WINDOW, offset=base)
+        self._base, self._at = base, end - base
+
+
+def _allocate(file: int, start: int, length: int) -> None:
+    """Have blocks of a disk for a part of a file; raise OSError where there are none."""
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file, start, length)
+    else:  # macOS
+        end = os.fstat(file).st_size
+        os.pwrite(file, bytes(start + length - end), end)
 
 
 def read_log(path: str | os.PathLike[str]) -> tuple[dict[str, Any], Iterator[Sent | Event]]:
@@ -191,6 +236,8 @@ def _records(
     layout = struct.Struct(f"<HQd{n + 2 * m}d")
     while at + _HEAD.size <= len(data):
         kind, zero, length = _HEAD.unpack_from(data, at)
+        if kind == zero == length == 0 and not any(data[at + _LONGEST_RECORD :]):
+            return
         at += _HEAD.size
         if at + length > len(data):
             return

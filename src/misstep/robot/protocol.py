@@ -86,6 +86,9 @@ class Observed(NamedTuple):
     timed_out: bool
 
 
+_COMMAND_KIND = int(Kind.COMMAND)
+
+
 def kind_of(message: bytes) -> int:
     """Return the first byte of a message; -1 if it is empty."""
     return message[0] if message else -1
@@ -129,23 +132,24 @@ def decode_state(message: bytes) -> State:
     MisstepError
         If it was cut.
     """
-    n = _count(message, _STATE.size)
-    _, flags, sequence, stamp, cost = _STATE.unpack_from(message)
+    values = _state(len(message)).unpack(message)
+    flags, cost = values[1], values[4]
     return State(
-        sequence,
-        stamp,
-        _row(n).unpack_from(message, _STATE.size),
+        values[2],
+        values[3],
+        values[5:],
         None if cost != cost else cost,
-        bool(flags & 1),
-        bool(flags & 2),
-        bool(flags & 4),
+        flags & 1 > 0,
+        flags & 2 > 0,
+        flags & 4 > 0,
     )
 
 
 def encode_command(command: Command) -> bytes:
     """Return a COMMAND message."""
-    head = _COMMAND.pack(Kind.COMMAND, command.reason, command.sequence, command.number)
-    return head + _row(2 * len(command.action)).pack(*command.intended, *command.action)
+    action, intended, reason, sequence, number = command
+    layout = _command(len(action))
+    return layout.pack(_COMMAND_KIND, reason, sequence, number, *intended, *action)
 
 
 def decode_command(message: bytes) -> Command:
@@ -192,6 +196,23 @@ def decode_observed(message: bytes) -> Observed:
     _, flags, reward = _OBSERVED.unpack_from(message)
     bits = [bool(flags >> i & 1) for i in range(5)]
     return Observed(_row(n).unpack_from(message, _OBSERVED.size), reward, *bits)
+
+
+# Looked up by length, because to read a format takes longer than to use it.
+
+
+@lru_cache(maxsize=64)
+def _state(length: int) -> struct.Struct:
+    """Return the layout of a STATE message of so many bytes."""
+    n, rest = divmod(length - _STATE.size, _DOUBLE)
+    if n < 0 or rest:
+        raise MisstepError(f"a message of {length} bytes was cut")
+    return struct.Struct(f"{_STATE.format}{n}d")
+
+
+@lru_cache(maxsize=64)
+def _command(m: int) -> struct.Struct:
+    return struct.Struct(f"{_COMMAND.format}{2 * m}d")
 
 
 @lru_cache(maxsize=64)

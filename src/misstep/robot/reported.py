@@ -4,6 +4,7 @@ The judging is that of `misstep.systems.Judged`, applied to a system whose steps
 robot instead of computed, so that a trial is judged alike wherever it is made.
 """
 
+from array import array
 from typing import Any
 
 import numpy as np
@@ -76,8 +77,6 @@ class Reported(System):
 class ReportedTrial:
     """One trial on a robot: judges each state and records each exchange.
 
-    Memory is taken once, for the longest trial.
-
     Parameters
     ----------
     system : System
@@ -105,11 +104,13 @@ class ReportedTrial:
         lasting = "failure" in judges and "success" not in judges
         self._reported = Reported(system, n_steps, lasting)
         self._system: System = Judged(self._reported, **judges) if judges else self._reported
+        self._take = self._judge if judges else self._believe
         self._has_cost = "cost" in judges
-        shape = (n_steps, len(system.action_columns))
         self._observations = np.zeros((n_steps + 1, len(system.observation_columns)))
-        self._actions, self._costs = np.zeros(shape), np.zeros(n_steps)
-        self._n_observations = self._n_actions = 0
+        self._actions, self._costs = array("d"), np.zeros(n_steps)
+        self._m = len(system.action_columns)
+        self._n_observations = 0
+        self._n_steps = n_steps
         self._costs_known = True
         self._failure_step: int | None = None
         self._success = False
@@ -124,8 +125,8 @@ class ReportedTrial:
         """Actions so far that were followed by a state."""
         return max(self._n_observations - 1, 0)
 
-    def observe(self, state: State) -> NDArray[np.float64]:
-        """Judge and record a state; return its observation, shape (n,).
+    def observe(self, state: State, observation: NDArray[np.float64]) -> None:
+        """Judge and record a state, and its observation as an array, (n,).
 
         Raises
         ------
@@ -133,25 +134,14 @@ class ReportedTrial:
             If the cost of it is not finite.
         """
         t = self._n_observations
-        self._reported.state = state
-        if t == 0:
-            observation, info = self._system.reset()
-        else:
-            action = self._actions[t - 1]
-            observation, reward, terminated, truncated, info = self._system.step(action)
-            self._costs[t - 1] = -float(reward)
-            self._costs_known &= self._has_cost or state.cost is not None
-            self.over = terminated or truncated
-            self._success = bool(info.get("success", False))
         self._observations[t] = observation
-        self._n_observations += 1
-        if self._failure_step is None and info.get("failed", False):
+        if self._take(state, t) and self._failure_step is None:
             self._failure_step = t
-        return observation
+        self._n_observations = t + 1
 
     def act(self, action: Row) -> None:
         """Record what was sent in answer to the state observed last."""
-        self._actions[self._n_observations - 1] = action
+        self._actions.extend(action)
 
     def mark(self, outcome: Outcome) -> None:
         """Let a person say what became of the trial, which ends it at the state observed last."""
@@ -163,6 +153,34 @@ class ReportedTrial:
         else:
             self._failure_step = None
 
+    def _believe(self, state: State, t: int) -> bool:
+        """Take what the robot says of a state for the truth; return whether it has failed."""
+        if t > 0:
+            if state.cost is None:
+                self._costs_known = False
+            else:
+                self._costs[t - 1] = state.cost
+            self._success = state.succeeded
+            self.over = state.over or t >= self._n_steps
+        return state.failed
+
+    def _judge(self, state: State, t: int) -> bool:
+        """Judge a state by formulas and by what the robot says; return whether it has failed."""
+        self._reported.state = state
+        if t == 0:
+            _, info = self._system.reset()
+        else:
+            _, reward, terminated, truncated, info = self._system.step(self._sent(t)[t - 1])
+            self._costs[t - 1] = -float(reward)
+            self._costs_known &= self._has_cost or state.cost is not None
+            self.over = terminated or truncated
+            self._success = bool(info["success"])
+        return bool(info["failed"])
+
+    def _sent(self, n: int) -> NDArray[np.float64]:
+        """Return the first `n` actions, (n, m)."""
+        return np.array(self._actions[: n * self._m]).reshape(n, self._m)
+
     def trajectory(self) -> Trajectory:
         """Return the trial, at least one step long."""
         n = self.n_steps
@@ -172,12 +190,12 @@ class ReportedTrial:
             outcome = Outcome.SUCCESS if self._success else Outcome.UNKNOWN
         return Trajectory(
             observations=self._observations[: n + 1],
-            actions=self._actions[:n],
-            dt=self._system.dt,
-            observation_columns=self._system.observation_columns,
-            action_columns=self._system.action_columns,
+            actions=self._sent(n),
+            dt=self._reported.dt,
+            observation_columns=self._reported.observation_columns,
+            action_columns=self._reported.action_columns,
             provenance=Provenance(
-                system=self._system.system_id,
+                system=self._reported.system_id,
                 parameters=self._parameters,
                 demonstrator=self.proposal.demonstrator,
                 seed=self.proposal.seed,

@@ -109,7 +109,7 @@ class ExplorationService:
     cadence : Cadence
         How long each exchange took, s.
     unlogged : int
-        Records that the disk refused.
+        Records for which there was no room on the disk, long after an emergency stop.
 
     Raises
     ------
@@ -135,10 +135,11 @@ class ExplorationService:
         self.limits = Limits.of(self._system) if limits is None else limits
         self._safety = Safety() if safety is None else safety
         self._guard = Guard(self.limits, self._safety)
+        self._shape = (len(self.limits.safe),)
         self._n_steps = _n_steps(self._system, duration)
-        self._simulated, self._clock = simulated_time, clock
+        self._simulated, self._stamp = simulated_time, 0.0
+        self._now: Clock = self._last_stamp if simulated_time else clock
         self._learning, self._on_trial = learning, on_trial
-        self._stamp = 0.0
         self._n_driven = len(list(run.folder.glob(f"{DRIVEN}/trial_*.h5"))) if run.folder else 0
         self._task = Task.of(self._system, run.config.state)
         self.cadence = Cadence()
@@ -259,28 +260,28 @@ class ExplorationService:
 
     def exchange(self, state: State) -> Command:
         """Return the command that answers a state, for any state whatsoever."""
+        guard = self._guard
         with self._lock:
-            if self._simulated and self._stamp < state.stamp < float("inf"):
+            if self._simulated and self._stamp < state.stamp < math.inf:
                 self._stamp = state.stamp
             asked = self._now()
-            self._watch(asked)
-            refusal = self._guard.check(state, asked)
+            refusal = guard.check(state, asked)
+            if guard.was_silent:
+                self._give_up()
+            trial = self._trial
             if refusal is not None:
                 self._event(f"state {state.sequence} refused: {refusal}")
-                return self._send(self._guard.keep_on(asked, Reason.REFUSED), None)
-            trial = self._trial
-            observation = None if trial is None else self._observe(trial, state)
-            if trial is None or observation is None:
-                return self._send(self._guard.keep_on(asked), state.observation)
-        action, flaw = _ask(trial.proposal.policy, observation, len(self.limits.safe))
+                return self._send(guard.keep_on(asked, Reason.REFUSED), asked, None)
+            if trial is None or not self._goes_on(trial, state):
+                return self._send(guard.keep_on(asked), asked, state.observation)
+            observation = guard.observation
+        action, flaw = self._ask(trial.proposal.policy, observation)
         with self._lock:
             now = self._now()
             if self._trial is not trial:  # stopped, or gone, while the policy was at work
-                return self._send(self._guard.keep_on(now), state.observation)
-            if action is None:
-                self._stop(f"the policy failed: {flaw}")
-                return self._send(self._guard.keep_on(now), state.observation)
-            command = self._send(self._guard.send(action, now, asked), state.observation)
+                return self._send(guard.keep_on(now), now, state.observation)
+            command = self._fail(flaw, now) if flaw else self._obey(action, now, asked)
+            command = self._send(command, now, state.observation)
             if self._trial is trial:
                 trial.act(command.action)
             self.cadence.add(now - asked)
@@ -303,7 +304,7 @@ class ExplorationService:
             stands = self._simulated and not self._guard.stopped
             if under_way or stands or self._guard.is_safe:
                 return None
-            return self._send(self._guard.keep_on(now), None)
+            return self._send(self._guard.keep_on(now), now, None)
 
     def mark(self, outcome: Outcome, who: str) -> bool:
         """Let a person judge the trial in progress, which ends it; return whether there was one."""
@@ -348,9 +349,20 @@ class ExplorationService:
             log, self._log = self._log, None
         if log is not None:
             log.close()
-        error = self._job.exception()
-        if error is not None:
+        if self._unkept is not None:
+            self._keep(*self._unkept)  # the disk may have room by now
+        elif (error := self._job.exception()) is not None:
             raise error
+
+    def _ask(
+        self, policy: Policy, observation: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], str]:
+        """Return a policy's action, (m,), and what is wrong with it: nothing, as a rule."""
+        try:
+            action = np.asarray(policy(observation), dtype=np.float64)
+        except Exception as error:  # a robot must not be left alone with its last action
+            return observation, f"{type(error).__name__}: {error}"
+        return action, "" if action.shape == self._shape else f"its action has shape {action.shape}"
 
     # Inside, with the lock held
 
@@ -364,27 +376,40 @@ class ExplorationService:
             return Phase.FINISHED
         return Phase.READY
 
-    def _now(self) -> float:
-        return self._stamp if self._simulated else self._clock()
+    def _last_stamp(self) -> float:
+        return self._stamp
 
     def _watch(self, now: float) -> None:
-        if self._trial is not None and self._guard.is_silent(now):
-            self._abandon("watchdog: no fresh state", Reason.WATCHDOG)
+        if self._guard.is_silent(now):
+            self._give_up()
 
-    def _observe(self, trial: ReportedTrial, state: State) -> NDArray[np.float64] | None:
-        """Judge and record a state; return None where that ends the trial."""
+    def _give_up(self) -> None:
+        self._abandon("watchdog: no fresh state", Reason.WATCHDOG)
+
+    def _goes_on(self, trial: ReportedTrial, state: State) -> bool:
+        """Judge and record a state; return whether the trial goes on."""
         try:
-            observation = trial.observe(state)
+            trial.observe(state, self._guard.observation)
         except MisstepError as error:
             self._stop(str(error))
-            return None
+            return False
         if not trial.over:
-            return observation
+            return True
         if trial.n_steps:
             self._finish(trial)
         else:
             self._abandon("over before its first action", Reason.IDLE)
-        return None
+        return False
+
+    def _obey(self, action: NDArray[np.float64], now: float, asked: float) -> Command:
+        try:
+            return self._guard.send(action, now, asked)
+        except MisstepError as error:
+            return self._fail(str(error), now)
+
+    def _fail(self, flaw: str, now: float) -> Command:
+        self._stop(f"the policy failed: {flaw}")
+        return self._guard.keep_on(now)
 
     def _finish(self, trial: ReportedTrial) -> None:
         if self._safety.dry_run:
@@ -406,7 +431,7 @@ class ExplorationService:
         self._abandon(why, Reason.IDLE)
         self._event(why)
 
-    # The log: what cannot be logged is not sent
+    # The log: what could not be logged is not sent
 
     def _open_log(self) -> ActionLog | None:
         if self.run.folder is None:
@@ -417,29 +442,34 @@ class ExplorationService:
         header = {**self.describe(), "time": utc_now(), "clock": self._now()}
         return ActionLog(folder / f"{number:04d}.log", header)
 
-    def _send(self, command: Command, observation: Row | None) -> Command:
-        """Log a command and return it; where it cannot be logged, an emergency stop instead."""
-        if self._log is None:
+    def _send(self, command: Command, now: float, observation: Row | None) -> Command:
+        """Log a command and return it; where the disk is full, an emergency stop instead."""
+        log = self._log
+        if log is None:
             return command
+        if not log.reserve():
+            self._disk_is_full()
+            command = self._guard.keep_on(now)
         try:
-            self._log.command(self._now(), command, observation)
+            log.command(now, command, observation)
         except OSError:
-            self._cannot_log()
-            return self._guard.keep_on(self._now())
+            self.unlogged += 1
         return command
 
     def _event(self, text: str) -> None:
-        if self._log is None:
+        log = self._log
+        if log is None:
             return
+        if not log.reserve():
+            self._disk_is_full()
         try:
-            self._log.event(self._now(), text)
+            log.event(self._now(), text)
         except OSError:
-            self._cannot_log()
+            self.unlogged += 1
 
-    def _cannot_log(self) -> None:
-        self.unlogged += 1
-        self._guard.stop()
-        self._trial = None
+    def _disk_is_full(self) -> None:
+        if not self._guard.stopped:
+            self._stop("the disk has no room for the log")
 
     # In the background, without the lock
 
@@ -448,18 +478,20 @@ class ExplorationService:
         if trial is not None:
             self._unkept = trial.proposal, trial.trajectory()
         if self._unkept is not None:
-            proposal, trajectory = self._unkept
-            if self._learning:
-                self.run.add(proposal.policy, trajectory, proposal.seconds)
-            elif self.run.folder is not None:
-                make_folder(self.run.folder / DRIVEN)
-                file = self.run.folder / DRIVEN / f"trial_{self._n_kept():03d}.h5"
-                save_dataset(Dataset([trajectory]), file)
-            self._unkept = None
-            self._n_driven += 1
-            if self._on_trial is not None:
-                self._on_trial(self.run, trajectory)
+            self._keep(*self._unkept)
         return self._same_policy() if not self._learning else self._next_policy()
+
+    def _keep(self, proposal: Proposal, trajectory: Trajectory) -> None:
+        if self._learning:
+            self.run.add(proposal.policy, trajectory, proposal.seconds)
+        elif self.run.folder is not None:
+            make_folder(self.run.folder / DRIVEN)
+            file = self.run.folder / DRIVEN / f"trial_{self._n_kept():03d}.h5"
+            save_dataset(Dataset([trajectory]), file)
+        self._unkept = None
+        self._n_driven += 1
+        if self._on_trial is not None:
+            self._on_trial(self.run, trajectory)
 
     def _next_policy(self) -> Proposal | None:
         return None if self.run.finished else propose(self.run, self._task)
@@ -472,20 +504,6 @@ class ExplorationService:
     def _n_kept(self) -> int:
         """Return how many trials have been kept: the number of the next one."""
         return len(self.run.trials) if self._learning else self._n_driven
-
-
-def _ask(policy: Policy, observation: NDArray[np.float64], m: int) -> tuple[Row | None, str | None]:
-    """Return a policy's action, (m,) and finite; or None and what is wrong with it."""
-    try:
-        action = np.asarray(policy(observation), dtype=np.float64)
-    except Exception as error:  # a robot must not be left alone with its last action
-        return None, f"{type(error).__name__}: {error}"
-    if action.shape != (m,):
-        return None, f"its action has shape {action.shape}"
-    row = tuple(action.tolist())
-    if not all(map(math.isfinite, row)):
-        return None, f"its action is {row}"
-    return row, None
 
 
 def _n_steps(system: System, duration: float) -> int:

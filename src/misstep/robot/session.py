@@ -50,6 +50,7 @@ class Host(Protocol):
 
 _LOG = logging.getLogger(__name__)
 _LONGEST_NAME = 40
+_STATE = int(Kind.STATE)  # an enumeration takes longer to look up
 
 
 class Hub:
@@ -183,7 +184,7 @@ class Session:
         """
         kind = kind_of(message)
         try:
-            if kind == Kind.STATE and self._welcome:
+            if kind == _STATE and self._welcome:
                 if not self._hub.drives(self):
                     raise MisstepError("another client drives")
                 self.tell(self._service.exchange(decode_state(message)))

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from misstep.errors import MisstepError
-from misstep.robot.limits import Limiter, Limits, Row
+from misstep.robot.limiter import Limiter
+from misstep.robot.limits import Limits, Row
 from misstep.robot.protocol import (
     VERSION,
     Kind,

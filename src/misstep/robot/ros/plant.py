@@ -11,7 +11,8 @@ import numpy as np
 
 from misstep.errors import MisstepError
 from misstep.parameters import ParameterValue
-from misstep.robot.limits import Limiter, Limits, Row
+from misstep.robot.limiter import Limiter
+from misstep.robot.limits import Limits, Row
 from misstep.systems import make_system
 
 _FOR_EVER = 1e9  # s

@@ -9,6 +9,7 @@ from misstep.robot.ros.bus import TRIGGER, Call, Handler, JointArrays
 from misstep.robot.ros1.calls import PersistentCall
 from misstep.robot.ros1.environment import import_ros, init_node
 from misstep.robot.ros1.messages import joint_arrays, joint_state
+from misstep.robot.ros1.persistent_service import persistent_service
 from misstep.robot.ros1.services import service_type
 
 
@@ -61,7 +62,8 @@ class Ros1Bus:
                 raise self._rospy.ServiceException(str(error)) from error
             return response(**fields) if isinstance(fields, Mapping) else response(*fields)
 
-        self._services.append(self._rospy.Service(service, _kind(kind), answer))
+        offer = persistent_service(self._rospy)
+        self._services.append(offer(service, _kind(kind), answer))
 
     def call(self, service: str, kind: str, timeout: float = 10.0) -> Call:
         """Return a function that calls a service, over a connection that stays."""

@@ -6,10 +6,15 @@ the robot with the last effort, with it.
 
 import socket
 import struct
+from io import BytesIO
 from typing import Any
 
 from misstep.errors import MisstepError
 from misstep.robot.ros1.environment import import_ros
+from misstep.robot.ros1.persistent_service import OK
+
+_LENGTH = struct.Struct("<I")
+_CHUNK = 4096
 
 
 class PersistentCall:
@@ -29,7 +34,7 @@ class PersistentCall:
     def __init__(self, rospy: Any, name: str, kind: Any, timeout: float = 10.0) -> None:
         self._rospy, self._name, self._kind = rospy, rospy.resolve_name(name), kind
         self._proxy: Any = None
-        self._request = kind._request_class
+        self._request, self._response = kind._request_class, kind._response_class
         self._timeout = timeout
 
     def __call__(self, **fields: Any) -> Any:
@@ -41,9 +46,14 @@ class PersistentCall:
             If there is no answer in time, or the node says what is wrong.
         """
         rospy = self._rospy
+        body = BytesIO()
+        self._request(**fields).serialize(body)
+        request = body.getvalue()
         try:
             proxy = self._proxy = self._proxy or self._open()
-            return proxy.call(self._request(**fields))
+            connection = proxy.transport.socket
+            connection.sendall(_LENGTH.pack(len(request)) + request)
+            return self._response().deserialize(_receive(connection))
         except (
             OSError,
             rospy.ServiceException,
@@ -70,8 +80,22 @@ class PersistentCall:
         )
         proxy.transport.buff_size = proxy.buff_size
         proxy.transport.connect(host, port, uri, timeout=self._timeout)
-        # rospy takes every timeout off its sockets; the operating system's stays.
+        # The operating system's timeout costs no system call a message.
+        proxy.transport.socket.setblocking(True)
         seconds, rest = divmod(self._timeout, 1.0)
         limit = struct.pack("@ll", int(seconds), round(rest * 1e6))
         proxy.transport.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
         return proxy
+
+
+def _receive(connection: socket.socket) -> bytes:
+    """Return the body of a response; raise OSError if there is none, or an error instead."""
+    data = connection.recv(_CHUNK)
+    while len(data) < OK.size or len(data) < OK.size + OK.unpack_from(data)[1]:
+        chunk = connection.recv(_CHUNK)
+        if not chunk:
+            raise ConnectionError("the node has hung up")
+        data += chunk
+    if not data[0]:
+        raise ConnectionError(data[OK.size :].decode(errors="replace"))
+    return data[OK.size :]

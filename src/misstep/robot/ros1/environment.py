@@ -6,6 +6,7 @@ name, so that no other package of the system can get between those of the enviro
 
 import importlib
 import sys
+import warnings
 from collections.abc import Sequence
 from importlib.machinery import ModuleSpec, PathFinder
 from types import ModuleType
@@ -46,7 +47,10 @@ def import_ros(name: str) -> Any:
     if _DebianFinder not in sys.meta_path:
         sys.meta_path.append(_DebianFinder)
     try:
-        return importlib.import_module(name)
+        with warnings.catch_warnings():
+            # Debian's own Python is older, and its ROS has escapes that 3.12 and later warn of.
+            warnings.simplefilter("ignore", SyntaxWarning)
+            return importlib.import_module(name)
     except ImportError as error:
         raise MisstepError(
             f"ROS 1 is not here ({error}): source its setup.bash, or on Debian 12 "

@@ -8,6 +8,7 @@ from types import ModuleType
 from typing import Any
 
 from misstep.robot.ros1.environment import import_ros
+from misstep.robot.ros1.quick import quick_explore
 
 PACKAGE = "misstep_ros"
 
@@ -23,6 +24,12 @@ def service_type(name: str) -> Any:
     MisstepError
         If ROS 1 is not installed.
     """
+    kind = generated_type(name)
+    return quick_explore(kind) if name == "Explore" else kind
+
+
+def generated_type(name: str) -> Any:
+    """Return a service type as genpy makes it."""
     if importlib.util.find_spec(PACKAGE) is not None:
         return getattr(import_ros(f"{PACKAGE}.srv"), name)
     module = ModuleType(f"{PACKAGE}.srv._{name}")
