@@ -9,7 +9,7 @@ from hypothesis import settings
 from misstep import MisstepError, demonstrate, make_system
 
 settings.register_profile("default", deadline=None, derandomize=True, max_examples=100)
-settings.register_profile("nightly", deadline=None, max_examples=2000)
+settings.register_profile("nightly", deadline=None, max_examples=10_000)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 # A shell that runs the tests in the background has interrupts ignored, and so would every program

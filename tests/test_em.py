@@ -62,7 +62,7 @@ def test_log_joint_against_the_reference(random_mixture, seed, d, K, n):
     X = samples_of(parameters, n, rng)
     work, out = em.Work.room_for(K, d), np.empty((-(-n // em.BLOCK) * em.BLOCK, K))
     assert compiled.precompute(parameters[0], parameters[2], work.whiteners, work.constants)
-    em.log_joint(em.in_blocks(X, np.ones(n)).blocks, parameters[1], work, out)
+    em.log_joint(em.in_blocks(X, np.ones(n)).blocks, parameters[1], np.zeros(d), work, out)
     np.testing.assert_allclose(out[:n], reference.log_joint(X, *parameters), rtol=1e-9, atol=1e-9)
 
 

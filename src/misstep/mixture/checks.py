@@ -11,15 +11,22 @@ from misstep.mixture import compiled
 Array = NDArray[np.float64]
 
 
-def are_definite(matrices: Array) -> bool:
-    """Whether each of (K, d, d) is finite, symmetric (but for rounding) and positive definite."""
-    if not np.all(np.isfinite(matrices)):
-        return False
-    rounding = 1e-9 * np.abs(matrices).max()
+def whiteners_of(matrices: Array) -> Array | None:
+    """Return L⁻¹ of each L Lᵀ (K, d, d), or None if one is not definite.
+
+    Definite is what is finite, symmetric but for rounding, and not so nearly singular that rounding
+    decides.
+    """
+    variances = np.diagonal(matrices, axis1=1, axis2=2)
+    if not np.all(np.isfinite(matrices)) or not np.all(variances > 0.0):
+        return None
+    deviations = np.sqrt(variances)
+    rounding = 1e-9 * deviations[:, :, None] * deviations[:, None, :]
     if np.any(np.abs(matrices - matrices.transpose(0, 2, 1)) > rounding):
-        return False
-    whitener = np.empty(matrices.shape[1:])
-    return all(math.isfinite(compiled.cholesky_whitener(m, whitener)) for m in matrices)
+        return None
+    whiteners = np.empty_like(matrices)
+    log_dets = map(compiled.cholesky_whitener, matrices, whiteners)
+    return whiteners if all(map(math.isfinite, log_dets)) else None
 
 
 def checked_points(a: ArrayLike, d: int) -> Array:

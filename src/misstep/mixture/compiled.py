@@ -23,9 +23,16 @@ _INLINED: dict[str, Any] = {"forceinline": True, "_nrt": False}
 LOG_2PI = math.log(2.0 * math.pi)
 
 
+# Of a variance of which no larger share is left by the columns before, rounding is most of it.
+SINGULAR = 1e-14
+
+
 @njit(**_COMPILED)
 def cholesky_whitener(covariance, whitener):
-    """Fill `whitener` with W = L⁻¹ of L Lᵀ = `covariance`; return log det W or NaN."""
+    """Fill `whitener` with W = L⁻¹ of L Lᵀ = `covariance`; return log det W.
+
+    Return NaN where the matrix is not definite, or so nearly singular that one could not tell.
+    """
     d = covariance.shape[0]
     log_det = 0.0
     for i in range(d):
@@ -35,7 +42,7 @@ def cholesky_whitener(covariance, whitener):
                 s -= whitener[i, m] * whitener[j, m]
             if i > j:
                 whitener[i, j] = s / whitener[j, j]
-            elif s > 0.0:
+            elif s > SINGULAR * covariance[i, i]:
                 whitener[i, i] = math.sqrt(s)
                 log_det -= math.log(whitener[i, i])
             else:
@@ -67,6 +74,8 @@ def precompute(weights, covariances, whiteners, constants):
 
 # What adds less than exp(−45) of a sum would not change its last bit, however many do.
 NEGLIGIBLE = 45.0
+# A log density so low that the double's range ends nearby.
+LOWEST = -1e300
 
 
 def scratch_for(K: int, d: int) -> NDArray[np.float64]:
@@ -115,6 +124,9 @@ def condition(state, constants, state_means, whiteners, gains, action_means, h, 
                 y += whiteners[k, i, j] * (state[j] - state_means[k, j])
             q += y * y
         h[k] = constants[k] - 0.5 * q
+        # Where the square overflows, all components are alike: far too far away.
+        if not h[k] > LOWEST:
+            h[k] = LOWEST
         top = max(top, h[k])
         for i in range(d):
             m[k, i] = action_means[k, i]
@@ -150,6 +162,14 @@ def scaled_variance(h, m, covariances, scale):
             second += h[k] * (covariances[k, i, i] + deviation * deviation)
         total += second / (scale[i] * scale[i])
     return total / d
+
+
+@njit(**_COMPILED)
+def exploration_of(spread, printed):
+    """ε of V/s², which may have overflowed."""
+    if printed:
+        return 1.0 / (1.0 + spread)
+    return spread / (1.0 + spread) if spread < np.inf else 1.0
 
 
 @njit(**_INLINED)
@@ -266,12 +286,19 @@ def mixture_densities(points, log_h, m, whiteners, log_norms, shape, values, gra
 
 @njit(**_COMPILED)
 def solve_definite(matrix, right, out, whitener, y):
-    """Solve `matrix` · out = `right` for a positive definite matrix (d, d)."""
+    """Solve `matrix` · out = `right` for a positive definite matrix (d, d).
+
+    Where it is nearly singular, only its diagonal counts.
+    """
     d = matrix.shape[0]
     if d == 1:
         out[0] = right[0] / matrix[0, 0]
         return
-    cholesky_whitener(matrix, whitener)
+    if not math.isfinite(cholesky_whitener(matrix, whitener)):
+        # Of a step that only has to go uphill, the column's own scale is enough.
+        for i in range(d):
+            out[i] = right[i] / matrix[i, i]
+        return
     for i in range(d):
         y[i] = 0.0
         for j in range(i + 1):
@@ -440,7 +467,7 @@ def answer(
     h, _, _, m, _ = _component_rooms(scratch, n_components, d)
     condition(state, state_constants, state_means, state_whiteners, gains, action_means, h, m)
     spread = scaled_variance(h, m, covariances, scale)
-    exploration = 1.0 / (1.0 + spread) if printed else spread / (1.0 + spread)
+    exploration = exploration_of(spread, printed)
     shape, ridge = donut_shape(exploration, d, k, reach)
     for i in range(n_components):
         h[i] = math.log(max(h[i], 1e-300))

@@ -18,7 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from misstep.errors import MisstepError
 from misstep.mixture import compiled
-from misstep.mixture.checks import checked_points
+from misstep.mixture.checks import checked_points, whiteners_of
 
 if TYPE_CHECKING:
     from misstep.mixture.gaussian_mixture import GaussianMixture
@@ -62,7 +62,8 @@ class Conditioner:
     Raises
     ------
     MisstepError
-        If `given` is not some, and not all, of the columns.
+        If `given` is not some, and not all, of the columns, or a covariance is so nearly singular
+        that nothing but rounding would be left of what remains.
     """
 
     def __init__(self, mixture: "GaussianMixture", given: Sequence[int]) -> None:
@@ -82,14 +83,21 @@ class Conditioner:
         self.state_whiteners = np.empty((K, n, n))
         self.state_constants = np.empty(K)
         state_covariances = np.ascontiguousarray(covariances[:, known][:, :, known])
-        compiled.precompute(
+        told = compiled.precompute(
             mixture.weights_, state_covariances, self.state_whiteners, self.state_constants
         )
-        for k in range(K):
-            cross = covariances[k][np.ix_(known, others)]
-            self.gains[k] = cho_solve(cho_factor(state_covariances[k]), cross).T
-            remaining = covariances[k][np.ix_(others, others)] - self.gains[k] @ cross
-            self.covariances[k] = 0.5 * (remaining + remaining.T)
+        if told:
+            for k in range(K):
+                cross = covariances[k][np.ix_(known, others)]
+                own = covariances[k][np.ix_(others, others)]
+                self.gains[k] = cho_solve(cho_factor(state_covariances[k]), cross).T
+                remaining = own - self.gains[k] @ cross
+                self.covariances[k] = 0.5 * (remaining + remaining.T)
+                told &= bool(np.all(np.diag(remaining) > compiled.SINGULAR * np.diag(own)))
+        if not told or whiteners_of(self.covariances) is None:
+            raise MisstepError(
+                f"a covariance is too nearly singular to be conditioned on the columns {known}"
+            )
 
     def at(self, state: ArrayLike) -> Conditional:
         """Return the mixture of the other columns at `state` of shape (n,).
@@ -97,7 +105,7 @@ class Conditioner:
         Raises
         ------
         MisstepError
-            If `state` has another shape or is not finite.
+            If `state` has another shape, is not finite, or so far away that the means are not.
         """
         x = np.array(state, dtype=np.float64)
         n = self.state_means.shape[1]
@@ -114,6 +122,7 @@ class Conditioner:
             h,
             m,
         )
+        _refuse_overflow(m)
         return Conditional(h, m, self.covariances)
 
     def at_each(self, states: ArrayLike) -> tuple[Array, Array]:
@@ -124,7 +133,7 @@ class Conditioner:
         Raises
         ------
         MisstepError
-            If `states` has another shape or is not finite.
+            If `states` has another shape, is not finite, or so far away that the means are not.
         """
         x = checked_points(states, self.state_means.shape[1])
         h = np.empty((len(x), len(self.gains)))
@@ -139,4 +148,12 @@ class Conditioner:
             h,
             m,
         )
+        _refuse_overflow(m)
         return h, m
+
+
+def _refuse_overflow(means: Array) -> None:
+    if not np.all(np.isfinite(means)):
+        raise MisstepError(
+            "a state lies so far from the mixture that the actions there leave the range of numbers"
+        )

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from misstep.errors import MisstepError
 from misstep.mixture import compiled
-from misstep.mixture.checks import are_definite, checked_points
+from misstep.mixture.checks import checked_points, whiteners_of
 
 Array = NDArray[np.float64]
 
@@ -62,6 +62,7 @@ class DonutShape(NamedTuple):
         check_family(k, reach)
         if d < 1:
             raise MisstepError(f"a donut takes at least one dimension, got d={d!r}")
+        check_hole(k, d)
         if not 0.0 <= exploration <= 1.0:
             raise MisstepError(f"exploration must be from 0 to 1, got {exploration!r}")
         shape, _ = compiled.donut_shape(float(exploration), d, float(k), float(reach))
@@ -69,9 +70,21 @@ class DonutShape(NamedTuple):
 
 
 def check_family(k: float, reach: float) -> None:
-    """Raise MisstepError unless k > 1 and reach ≥ 1, both finite."""
-    if not (1.0 < k < math.inf and 1.0 <= reach < math.inf):
-        raise MisstepError(f"a donut takes k > 1 and reach ≥ 1, got k={k!r} and reach={reach!r}")
+    """Raise MisstepError unless k > 1 is finite and reach from 1 to 10⁹."""
+    if not (1.0 < k < math.inf and 1.0 <= reach <= 1e9):
+        raise MisstepError(
+            f"a donut takes k > 1 and reach ≥ 1, at most 1e9, got k={k!r} and reach={reach!r}"
+        )
+
+
+def check_hole(k: float, d: int) -> None:
+    """Raise MisstepError unless kᵈ − 1, which γ is made of, leaves the hole enough digits."""
+    exponent = d * math.log(k)
+    if not 1e-9 <= exponent <= math.log(1e9):
+        raise MisstepError(
+            f"a donut in {d} dimensions takes k from {math.exp(1e-9 / d):.12g} to "
+            f"{math.exp(math.log(1e9) / d):.4g}, or rounding closes its hole; got k={k!r}"
+        )
 
 
 class Donut:
@@ -109,13 +122,15 @@ class Donut:
             )
         if not np.all(np.isfinite(self.mean)):
             raise MisstepError(f"a donut's mean must be finite, got {self.mean.tolist()}")
-        if not are_definite(self.base_covariance[None]):
+        if whiteners_of(self.base_covariance[None]) is None:
             raise MisstepError("a donut's covariance must be symmetric positive definite")
         gamma, r_alpha, r_beta = shape
         if not 0.0 < r_alpha < r_beta:
             raise MisstepError(f"a donut needs 0 < r_alpha < r_beta, got {r_alpha} and {r_beta}")
+        if gamma > 1.0:
+            check_hole(r_beta / r_alpha, d)
         most = 1.0 / (1.0 - (r_alpha / r_beta) ** d)
-        if not 1.0 <= gamma <= most * (1.0 + 1e-12):
+        if not 1.0 <= gamma <= most * (1.0 + 4e-15 * most):
             raise MisstepError(
                 f"gamma must be from 1 to 1/(1 − k⁻ᵈ) = {most:g}, or the density is negative at "
                 f"the centre; got {gamma:g}"
@@ -154,7 +169,9 @@ class Donut:
         rows = []
         for point in checked_points(a, self.mean.size):
             value, slope, direction = self._evaluate(point)
-            rows.append(math.exp(value) * slope * direction)
+            # Beyond the range of double precision the density is flat, and the slope infinite.
+            is_zero = value == -math.inf
+            rows.append(np.zeros_like(point) if is_zero else math.exp(value) * slope * direction)
         return np.array(rows)
 
     def _evaluate(self, point: Array) -> tuple[float, float, Array]:

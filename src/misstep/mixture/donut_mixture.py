@@ -54,8 +54,10 @@ def exploration_from_variance(
         raise MisstepError(
             f"exploration takes a variance that is finite and not negative, got {v.tolist()}"
         )
-    spread = float(np.mean(np.diag(v) / s**2))
-    return 1.0 / (1.0 + spread) if formula == "printed" else spread / (1.0 + spread)
+    with np.errstate(over="ignore"):
+        spread = float(np.mean(np.diag(v) / s**2))
+    exploration: float = compiled.exploration_of(spread, formula == "printed")
+    return exploration
 
 
 class DonutMixture:
@@ -104,6 +106,8 @@ class DonutMixture:
     def gradient(self, a: ArrayLike) -> Array:
         """Return the gradient of the density at points of shape (N, d), shape (N, d)."""
         values, gradients = self._evaluate(a)
+        # Beyond the range of double precision the density is flat, and the slope infinite.
+        gradients[values == -np.inf] = 0.0
         scaled: Array = np.exp(values)[:, None] * gradients
         return scaled
 

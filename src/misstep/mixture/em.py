@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 
 BLOCK = 256
 PANEL = 4
+# Variance as a share of a squared step of the mean, below which rounding takes six digits of it.
+JUMP = 1e-10
 
 COMPILED: dict[str, Any] = {"cache": True, "nogil": True, "_nrt": False}
 INLINED: dict[str, Any] = {"fastmath": REORDER, "forceinline": True, "_nrt": False}
@@ -301,15 +303,22 @@ def maximise(moments, mixture, floor):
         # A component that no sample claims keeps its place: dividing by its mass would be 0/0.
         if mass[k] <= 1e-12 * total:
             continue
+        told = True
         for j in range(d):
             first[k, j] /= mass[k]
+            means[k, j] += first[k, j]
+            step = first[k, j] * first[k, j]
+            told &= second[k, j, j] / mass[k] - step + floor > JUMP * step
+        # About so distant an old mean nothing is told of the spread about the new one: this time
+        # only the mean moves, which raises the likelihood too (conditional maximisation).
+        if not told:
+            continue
         for j in range(d):
             for m in range(j + 1):
                 s = second[k, j, m] / mass[k] - first[k, j] * first[k, m]
                 covariances[k, j, m] = s
                 covariances[k, m, j] = s
             covariances[k, j, j] += floor
-            means[k, j] += first[k, j]
 
 
 @njit(**COMPILED)
@@ -350,13 +359,22 @@ def iterate(samples, mixture, moments, work, first_panel, last_panel, total_weig
 
 
 @njit(**COMPILED)
-def log_joint(blocks, means, work, out):
-    """Fill `out` (blocks · BLOCK, K) with log π_k N(x_i; μ_k, Σ_k)."""
+def log_joint(blocks, means, origin, work, out):
+    """Fill `out` (blocks · BLOCK, K) with log π_k N(x_i; μ_k, Σ_k).
+
+    Whitening is exact only next to the origin, and the data may lie far from it: here the deviation
+    is whitened, where `iterate`, whose samples are standardised, whitens sample and mean. `origin`
+    (d,) is zero: nothing is allocated here.
+    """
+    n_components, d = means.shape
     for block in range(blocks.shape[0]):
-        for k in range(means.shape[0]):
+        for k in range(n_components):
             p = work.log_p[k]
+            for j in range(d):
+                for b in range(BLOCK):
+                    work.deviations[j, b] = blocks[block, j, b] - means[k, j]
             _log_component(
-                blocks[block], means[k], work.whiteners[k], work.constants[k], p, work.rows[0]
+                work.deviations, origin, work.whiteners[k], work.constants[k], p, work.rows[0]
             )
             for b in range(BLOCK):
                 out[block * BLOCK + b, k] = p[b]

@@ -14,12 +14,16 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from misstep.errors import MisstepError
 from misstep.mixture import compiled, em, fitting, starts
-from misstep.mixture.checks import are_definite
+from misstep.mixture.checks import whiteners_of
 from misstep.mixture.chunks import SUBSAMPLE, StandardisedChunks, survey
 from misstep.mixture.conditional import Conditional, Conditioner
 from misstep.mixture.em import Mixture, Rule, Samples
 
 Array = NDArray[np.float64]
+
+
+# Rounding leaves what is constant a spread of some units in the last place.
+CONSTANT = 1e-13
 
 
 class Ellipse(NamedTuple):
@@ -159,7 +163,7 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         if not np.all(np.isfinite(m)):
             raise MisstepError("mixture means must be finite")
         # Weights that sum to 1 but for rounding stay as they are: a mixture restored is the same.
-        if not math.isclose(w.sum(), 1.0, rel_tol=1e-12):
+        if not math.isclose(w.sum(), 1.0, rel_tol=1e-14):
             w /= w.sum()
         self = cls(n_components=len(w))
         self._set_parameters(w, m, c)
@@ -414,7 +418,8 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         self.bics_ = {}
         bounds = {}
         for K in sorted(fits):
-            if not math.isfinite(fits[K].log_likelihood):
+            variances = np.diagonal(fits[K].mixture.covariances, axis1=1, axis2=2)
+            if not math.isfinite(fits[K].log_likelihood) or variances.min() <= CONSTANT**2:
                 raise MisstepError(
                     f"a covariance of the {K}-component fit collapsed: the samples lie on a line "
                     f"or a point; a covariance_floor > {self.covariance_floor:g} prevents it"
@@ -448,16 +453,20 @@ class GaussianMixture(DensityMixin, BaseEstimator):
             raise MisstepError(f"weights_init must be positive and finite, got {weights.tolist()}")
         if not np.all(np.isfinite(means)):
             raise MisstepError("means_init must be finite")
-        if not are_definite(precisions):
+        whiteners = whiteners_of(precisions * np.outer(scale, scale))
+        if whiteners is None:
             raise MisstepError("precisions_init must be symmetric positive definite")
-        covariances = np.linalg.inv(precisions) / np.outer(scale, scale)
+        covariances = whiteners.transpose(0, 2, 1) @ whiteners
         return Mixture(weights / weights.sum(), means, covariances)
 
     def _set_parameters(self, weights: Array, means: Array, covariances: Array) -> None:
-        if not are_definite(covariances):
-            raise MisstepError("a mixture covariance is not symmetric positive definite")
+        if whiteners_of(covariances) is None:
+            raise MisstepError(
+                "a mixture covariance is not symmetric positive definite, or too nearly singular"
+            )
         K, d = means.shape
         whiteners, constants = np.empty((K, d, d)), np.empty(K)
+        covariances = 0.5 * (covariances + covariances.transpose(0, 2, 1))
         compiled.precompute(weights, covariances, whiteners, constants)
         self.weights_, self.means_, self.covariances_ = weights, means, covariances
         self.n_components_ = K
@@ -466,14 +475,19 @@ class GaussianMixture(DensityMixin, BaseEstimator):
     def _log_joint(self, X: ArrayLike) -> Array:
         check_is_fitted(self)
         samples = validate_data(self, X, dtype=np.float64, reset=False)
-        # Whitening is exact only near the origin, and the data may lie far from it.
-        origin = self.means_[0]
-        blocks, _ = em.in_blocks(samples - origin, np.zeros(len(samples)))
+        blocks, _ = em.in_blocks(samples, np.zeros(len(samples)))
         work = em.Work.room_for(*self.means_.shape)
         work.whiteners[:], work.constants[:] = self._whiteners, self._constants
         joint = np.empty((len(blocks) * em.BLOCK, len(self.means_)))
-        em.log_joint(blocks, self.means_ - origin, work, joint)
-        return joint[: len(samples)]
+        em.log_joint(blocks, self.means_, np.zeros(samples.shape[1]), work, joint)
+        joint = joint[: len(samples)]
+        told = joint.max(axis=1) >= compiled.LOWEST
+        if not np.all(told):
+            raise MisstepError(
+                f"sample {int(np.argmin(told))} lies so far from every component that its "
+                f"log density leaves the range of numbers"
+            )
+        return joint
 
 
 def effective_size(sample_weight: Array) -> float:
@@ -516,7 +530,8 @@ def _checked_weight(sample_weight: ArrayLike | None, X: Array) -> Array:
         raise MisstepError("sample_weight must be finite and nowhere negative")
     if not np.any(weight > 0):
         raise MisstepError("every sample_weight is zero: nothing is left to fit")
-    return weight
+    # A power of two changes no bit of the fit, and no sum of weights leaves the range of numbers.
+    return np.ldexp(weight, -np.frexp(weight.max())[1])
 
 
 def _standardise(X: Array, weight: Array) -> tuple[Array, Array, Array]:
@@ -535,8 +550,7 @@ def _standardise(X: Array, weight: Array) -> tuple[Array, Array, Array]:
 
 def _refuse_constant(first: Array, extent: Array, scale: Array) -> None:
     """Raise MisstepError if a column, of which `first` is a value, hardly varies."""
-    # Rounding leaves a constant column a spread of some units in the last place.
-    constant = np.flatnonzero(scale <= 1e-13 * extent)
+    constant = np.flatnonzero(scale <= CONSTANT * extent)
     if len(constant):
         column = int(constant[0])
         raise MisstepError(

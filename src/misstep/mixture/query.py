@@ -7,7 +7,7 @@ from misstep.errors import MisstepError
 from misstep.mixture import compiled
 from misstep.mixture.checks import checked_points
 from misstep.mixture.conditional import Conditioner
-from misstep.mixture.donut import DEFAULT_K, DEFAULT_REACH, check_family
+from misstep.mixture.donut import DEFAULT_K, DEFAULT_REACH, check_family, check_hole
 from misstep.mixture.donut_mixture import FORMULAS, component_arrays
 
 Array = NDArray[np.float64]
@@ -41,12 +41,15 @@ class DonutQuery:
         reach: float = DEFAULT_REACH,
         formula: str = "prose",
     ) -> None:
-        check_family(k, reach)
         c = conditioner
         K, d = c.action_means.shape
+        check_family(k, reach)
+        check_hole(k, d)
         s = np.array(scale, dtype=np.float64)
-        if s.shape != (d,) or not np.all((s > 0) & (s < np.inf)):
-            raise MisstepError(f"the scale must be {d} positive numbers, got {s.tolist()}")
+        if s.shape != (d,) or not np.all((s > 1e-150) & (s < 1e150)):  # they are squared
+            raise MisstepError(
+                f"the scale must be {d} positive numbers, 1e-150 to 1e150, got {s.tolist()}"
+            )
         if formula not in FORMULAS:
             raise MisstepError(f"the formula is 'prose' or 'printed', got {formula!r}")
         self._family = (formula == "printed", float(k), float(reach), s)
