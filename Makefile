@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 OUT ?= out/paper
 
-.PHONY: demo test check format gazebo clean
+.PHONY: demo test check nightly format gazebo clean
 
 demo: $(READY)  ## The paper, from five sets of failed demonstrations; ends with the report's path.
 	$(BIN)/misstep reproduce --quick --out $(OUT)
@@ -15,12 +15,16 @@ demo: $(READY)  ## The paper, from five sets of failed demonstrations; ends with
 test: $(READY) check  ## Every check and every test.
 	$(BIN)/pytest -n 2 --ignore tests/test_hot_paths.py
 
-check: $(READY)  ## Lint, format, types, who imports whom, instructions of the two hot paths.
+check: $(READY)  ## Lint, format, types, imports, the documentation, instructions of the hot paths.
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
+	$(BIN)/mkdocs build --strict --quiet
 	$(BIN)/pytest -q tests/test_hot_paths.py
+
+nightly: $(READY)  ## Mixtures and donuts against sixty digits, 10,000 examples of each property.
+	HYPOTHESIS_PROFILE=nightly $(BIN)/pytest tests/test_numerical_stress.py
 
 format: $(READY)  ## Mend what can be mended by a machine.
 	$(BIN)/ruff check --fix .
@@ -36,4 +40,4 @@ gazebo: $(READY)  ## The bridge to Gazebo's physics, for the system cartpole-gaz
 	$(BIN)/python -m misstep.robot.gazebo.build
 
 clean:  ## Remove the environment and all outputs.
-	rm -rf $(VENV) out .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) out site .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,20 +1,40 @@
-"""The examples run, and the README shows the same code."""
+"""The examples run as scripts, and the README shows the same code as the first."""
 
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 QUICKSTART = ROOT / "examples" / "quickstart.py"
 
+# What each prints when it has done what it says.
+PRINTED = {
+    "quickstart": r"1 trials, success: True\nthe last policy balances from \d+% of starts, .*\n",
+    "idea": r"\d components, chosen by minimum BIC\n(.* N\n){3}picture in idea.png\n",
+    "own_system": r"\[.*\]\n(failure after .*\n){4}\d+ trials, success: True\n\d+ of 10 .*\n",
+}
 
-def test_quickstart_runs():
+
+def test_there_is_an_expectation_of_each_example():
+    assert {path.stem for path in (ROOT / "examples").glob("*.py")} == set(PRINTED)
+
+
+@pytest.mark.parametrize("name", PRINTED)
+def test_example_runs(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "Agg")
     done = subprocess.run(
-        [sys.executable, "-W", "error", str(QUICKSTART)], capture_output=True, text=True, check=True
+        [sys.executable, "-W", "error", str(ROOT / "examples" / f"{name}.py")],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
     )
-    assert re.search(r"\d+ trials, success: (True|False)\n", done.stdout)
-    assert re.search(r"balances from \d+% of starts, \d+% to \d+%\n", done.stdout)
+    assert done.returncode == 0, done.stderr
+    assert re.fullmatch(PRINTED[name], done.stdout), done.stdout
+    for picture in re.findall(r"picture in (\S+)", done.stdout):
+        assert (tmp_path / picture).stat().st_size > 10_000
 
 
 def test_readme_shows_the_quickstart():
