@@ -6,9 +6,7 @@
 
 Both start from the same seeds, so the noise of the demonstrators is the same in both and the
 repetitions are pairs: Wilcoxon's signed-rank test on the cost of a repetition, by variant and
-horizon, Holm's correction over all of them. With a motion as sensitive as a falling pole's, two
-engines that agree to 1e-9 over 5,000 steps of equal length still part when one integrates with
-Euler and the other with Runge-Kutta; what may not change is the distribution.
+horizon, Holm's correction over all of them. What makes them differ is the subject of rail_stop.py.
 """
 
 import sys
