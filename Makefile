@@ -20,7 +20,7 @@ check: $(READY)  ## Lint, format, types, imports, the documentation, instruction
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
-	$(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	$(BIN)/pytest -q tests/test_hot_paths.py
 
 nightly: $(READY)  ## Mixtures and donuts against sixty digits, 10,000 examples of each property.
