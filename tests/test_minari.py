@@ -6,9 +6,7 @@ import gymnasium as gym
 import minari
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from minari.data_collector import EpisodeBuffer
-from mutations import fuzzed, mutations, survives
 
 from misstep import Column, Dataset, MisstepError, Outcome, Provenance, Trajectory
 from misstep.formats import ReadOptions, load_dataset, read_episodes, save_dataset
@@ -230,14 +228,3 @@ def test_metadata_that_is_refused(tmp_path, refused, change, line):
     place.write_text(json.dumps(json.loads(place.read_text()) | change))
     with refused(line):
         load_dataset(path)
-
-
-@pytest.mark.parametrize("format", STORAGES.values())
-@settings(max_examples=fuzzed(40))
-@given(mutation=mutations())
-def test_damage(tmp_path_factory, format, mutation):
-    folder = tmp_path_factory.getbasetemp()
-    whole = folder / f"whole-{format}"
-    if not whole.exists():
-        save_dataset(three()[:2], whole, format=format)
-    survives(whole, folder / f"damaged-{format}", mutation, format=format)

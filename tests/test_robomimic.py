@@ -1,11 +1,8 @@
 import json
-import os
 
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from mutations import fuzzed, mutations, survives
 
 from misstep import Column, Dataset, Outcome, Provenance, Trajectory
 from misstep.formats import ReadOptions, load_dataset, read_episodes, save_dataset
@@ -206,24 +203,3 @@ def test_damaged_texts_crash_nothing(tmp_path, refused, monkeypatch):
     path.write_bytes(whole)
     with refused("env_args is damaged"):
         load_dataset(path)
-
-
-@settings(max_examples=fuzzed(60))
-@given(mutation=mutations())
-def test_damage(tmp_path_factory, mutation):
-    folder = tmp_path_factory.getbasetemp()
-    whole = folder / "robomimic.h5"
-    if not os.path.exists(whole):
-        save_dataset(Dataset([make(), make(300, costs=None)]), whole, format="robomimic")
-    survives(whole, folder / "damaged_robomimic.h5", mutation)
-
-
-@settings(max_examples=fuzzed(8))
-@given(mutation=mutations())
-def test_damage_to_a_file_of_others(tmp_path_factory, mutation):
-    # With texts of variable length, which another process reads.
-    folder = tmp_path_factory.getbasetemp()
-    whole = folder / "others.hdf5"
-    if not os.path.exists(whole):
-        as_documented(whole, images=False)
-    survives(whole, folder / "damaged_others.hdf5", mutation, format="robomimic")

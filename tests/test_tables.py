@@ -10,7 +10,6 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mutations import fuzzed
 from peak_memory import needs_status, run_with_peak
 
 from misstep import Column, Dataset, MisstepError, Outcome, Provenance, Trajectory
@@ -400,62 +399,7 @@ def test_a_format_is_chosen_by_name_or_suffix(table, refused):
         list(read_episodes(path.parent / "b.csv"))
 
 
-# Damage
-
-SMALL = Dataset([make(3), make(2, seed=1, outcome="failure", failure_step=2, costs=None)])
-
-
-def image(suffix, dataset=SMALL):
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = os.path.join(folder, f"a.{suffix}")
-        save_dataset(dataset, path)
-        with open(path, "rb") as file:
-            return file.read()
-
-
-edits = st.lists(
-    st.tuples(
-        st.integers(0, 2**16),
-        st.integers(0, 30),
-        st.none()
-        | st.binary(max_size=8)
-        | st.sampled_from([b",", b"\n", b'"', b"nan", b"1e999", b";", b"\x00", b"-", b"{}"]),
-    ),
-    min_size=1,
-    max_size=4,
-)
-
-
-def edited(whole, changes):
-    """Cut out, overwrite and double (None) some bytes of a file."""
-    data = bytearray(whole)
-    for at, size, new in changes:
-        at %= len(data) + 1
-        data[at : at + size] = bytes(data[at : at + size]) * 2 if new is None else new
-    return bytes(data)
-
-
-@pytest.mark.parametrize("suffix", ["csv", "parquet", "h5"])
-def test_damaged_files_are_read_or_refused(tmp_path, suffix):
-    path, whole = tmp_path / f"a.{suffix}", image(suffix)
-    refusals = []
-
-    @settings(max_examples=fuzzed(300))
-    @given(edits, st.sampled_from([None, 50.0]))
-    def check(changes, rate):
-        path.write_bytes(edited(whole, changes))
-        try:
-            for episode in read_episodes(path, ReadOptions(rate=rate)):
-                joined(episode)
-                episode.ending()
-        except MisstepError as error:
-            refusals.append(str(error))
-
-    check()
-    assert len(refusals) > 10
-    assert all("\n" not in line and str(path) in line for line in refusals)
+# Damage; the rest of it is up to tests/test_hostile.py
 
 
 @given(st.text(st.sampled_from("0123456789.,;-+eE \t\n\r\"'#naif_x[]:{}é\x00"), max_size=80))

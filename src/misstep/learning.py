@@ -210,7 +210,7 @@ def kept_in(run: Run, out: str | os.PathLike[str] | None) -> Iterator[None]:
         yield
     except MisstepError:
         if is_new and run.folder is not None and not run.trials:
-            shutil.rmtree(run.folder)
+            shutil.rmtree(run.folder, ignore_errors=True)  # as far as rights allow
         raise
 
 

@@ -5,7 +5,7 @@ command line and the Python interface of a system or a demonstrator. What a fiel
 written once, beside it, and checked whenever an instance is made.
 """
 
-import math
+import sys
 from collections.abc import Mapping
 from dataclasses import Field, field, fields
 from typing import Any, NamedTuple, TypeVar, cast
@@ -17,6 +17,7 @@ P = TypeVar("P")
 ParameterValue = float | int | bool | str
 """What one parameter can hold; exactly what a file or a command line can hold too."""
 
+_LARGEST = sys.float_info.max  # a whole number of Python's can be larger
 _KIND_OF = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
 
 
@@ -123,17 +124,17 @@ def check_parameters(parameters: Any, owner: str) -> None:
 def _of_type(f: Field[Any], value: object, owner: str) -> ParameterValue:
     wanted: Any = f.type
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    if wanted is float and number:
-        value = float(value)  # type: ignore[arg-type]
-        if math.isfinite(value):
-            return value
-    elif wanted is int and number and value == int(value):  # type: ignore[call-overload]
+    finite = number and -_LARGEST <= value <= _LARGEST  # type: ignore[operator]
+    if wanted is float and finite:
+        return float(value)  # type: ignore[arg-type]
+    if wanted is int and finite and value == int(value):  # type: ignore[call-overload]
         return int(value)  # type: ignore[call-overload]
-    elif wanted in (bool, str) and isinstance(value, wanted):
+    if wanted in (bool, str) and isinstance(value, wanted):
         return value
     unit = f" in {f.metadata['unit']}" if f.metadata["unit"] else ""
-    finite = "finite " if isinstance(value, float) and not math.isfinite(value) else ""
-    kind = _KIND_OF[wanted].replace("a number", f"a {finite}number")
+    kind = _KIND_OF[wanted]
+    if number and not finite:
+        kind = kind.replace("a number", "a finite number")
     raise MisstepError(f"{owner}: {f.name} is {value!r} but must be {kind}{unit}: {_meaning(f)}")
 
 

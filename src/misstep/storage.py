@@ -5,15 +5,18 @@ renamed over the old one in a single step. Whoever reads sees the old file or th
 process killed at any instant leaves at worst a hidden folder ``.NAME.XXXX.tmp`` behind.
 """
 
+import atexit
 import json
 import os
+import secrets
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from misstep.errors import MisstepError
+
+_hidden: set[Path] = set()
 
 
 def atomic_write(path: str | os.PathLike[str], write: Callable[[Path], object]) -> None:
@@ -40,17 +43,36 @@ def atomic_write(path: str | os.PathLike[str], write: Callable[[Path], object]) 
     if target.is_dir():
         raise MisstepError(f"cannot write {path}: it is a folder; name a file")
     with refusals_told(path):
-        folder = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent))
-        try:
+        with hidden_folder(target) as folder:
             temporary = folder / target.name
             write(temporary)
             if target.exists():
                 shutil.copymode(target, temporary)
             flush(temporary)
             temporary.replace(target)
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
         flush(target.parent)
+
+
+@contextmanager
+def hidden_folder(target: Path) -> Iterator[Path]:
+    """Make an empty folder beside `target` that is taken away again, with all that is in it.
+
+    Also where an interrupt comes while it is made or taken away: then when the process ends.
+    """
+    folder = target.parent / f".{target.name}.{secrets.token_hex(6)}.tmp"
+    _hidden.add(folder)
+    try:
+        folder.mkdir(mode=0o700)
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        _hidden.discard(folder)
+
+
+@atexit.register
+def _take_away() -> None:
+    for folder in _hidden:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:

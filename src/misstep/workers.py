@@ -13,8 +13,9 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, as_completed, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager
-from typing import NamedTuple, TypeVar
+from contextlib import ExitStack, contextmanager, suppress
+from multiprocessing.connection import Connection
+from typing import Any, NamedTuple, TypeVar
 
 from misstep.errors import MisstepError
 
@@ -80,16 +81,39 @@ def check_workers(workers: int | None) -> int:
     return workers or os.cpu_count() or 1
 
 
+class _Pool(ProcessPoolExecutor):
+    """Holds interrupts back from its processes until they know what to do with them.
+
+    A Ctrl-C goes to all processes of a terminal, and one that was still importing would print a
+    traceback. A process inherits what is held back; the initializer lets it through.
+    """
+
+    def submit(self, fn: Callable[..., R], /, *args: Any, **kwargs: Any) -> "Future[R]":
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            return super().submit(fn, *args, **kwargs)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 @contextmanager
 def process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     """Open processes that end with this one and drop what is waiting after an error."""
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, initializer=_end_with_parent) as pool:
-        try:
-            yield pool
-        except BaseException:
+    heard, said = context.Pipe(duplex=False)
+    pool = _Pool(workers, context, initializer=_end_with_parent, initargs=(heard,))
+    try:
+        yield pool
+    except BaseException:
+        said.close()  # what they are at is wanted no more, and may take long
+        # A Ctrl-C ends them too, and then the pool may be closing itself at this very moment.
+        with suppress(OSError):
             pool.shutdown(wait=False, cancel_futures=True)
-            raise
+        raise
+    finally:
+        heard.close()
+    pool.shutdown()
+    said.close()
 
 
 def run_in_processes(
@@ -143,15 +167,16 @@ def _submit(pool: ProcessPoolExecutor, function: Callable[[J], R], job: J) -> Fu
         return future
 
 
-def _end_with_parent() -> None:
-    """Have a worker end when its parent does, however that ends, and at Ctrl-C without a word."""
+def _end_with_parent(heard: Connection) -> None:
+    """Have a worker end when its parent does or says so, and at Ctrl-C without a word.
+
+    However the parent ends, nobody is at the other end of the pipe `heard` any more.
+    """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        return
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
     def watch() -> None:
-        parent.join()
+        heard.poll(None)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()

@@ -5,8 +5,9 @@ code meaning
 ==== ==============================================================================
 0    the command did what it claims
 1    it ran, and did not: no trial succeeded; or nobody read its output to the end
-2    bad input: one line on stderr says what, where, and what would be right
+2    bad input, or out of memory: one line on stderr says what, where, and what would be right
 130  interrupted with Ctrl-C
+143  terminated with SIGTERM
 ==== ==============================================================================
 """
 
@@ -35,6 +36,7 @@ from misstep.cli import (
     serve,
     study,
 )
+from misstep.cli.interruption import Terminated, interruptible
 from misstep.errors import MisstepError
 from misstep.version import __version__
 
@@ -53,6 +55,9 @@ class _Commands(TyperGroup):
 
 # The backspace keeps the help from breaking the line.
 _EXAMPLE = "\b\nExample:\n  {}"
+
+_ROOM = 2**26
+"""Bytes. What goes wrong where so many cannot be had goes wrong for want of memory."""
 
 # Plain help instead of boxes: it is there at once, and an example in it can be copied.
 app = typer.Typer(cls=_Commands, add_completion=False, rich_markup_mode=None)
@@ -114,27 +119,57 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         The exit code.
     """
-    _replace_unprintable()
-    words = list(sys.argv[1:] if arguments is None else arguments)
-    command = typer.main.get_command(app)
+    with interruptible():
+        return _run(list(sys.argv[1:] if arguments is None else arguments))
+
+
+def _run(words: list[str]) -> int:
     try:
+        _replace_unprintable()
+        command = typer.main.get_command(app)
         # Not `app(...)`, which has its own ideas of interrupts, closed pipes and tracebacks.
         with command.make_context("misstep", words) as context:
             code = command.invoke(context)
         sys.stdout.flush()
     except typer.Exit as exit_:
         return exit_.exit_code
-    except typer.TyperException as error:
-        return _tell(f"error: {_usage(error)}", 2)
-    except MisstepError as error:
-        return _tell(f"error: {error}", 2)
-    except KeyboardInterrupt as interrupt:
-        return _tell("; ".join(["interrupted", *map(str, interrupt.args)]), 130)
     except BrokenPipeError:
         # Python flushes stdout once more at its end, and would complain.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except (Exception, KeyboardInterrupt) as error:
+        told = _explain(error)
+        if told is None:
+            raise
+        return _tell(*told)
     return int(code or 0)
+
+
+def _explain(error: BaseException) -> tuple[str, int] | None:
+    """Return why a command ends and its exit code; None for what is a fault of ours."""
+    interrupt: BaseException | None = error
+    # A library that is interrupted in mid-import makes an ImportError of it.
+    while interrupt is not None and not isinstance(interrupt, KeyboardInterrupt):
+        interrupt = interrupt.__cause__
+    if interrupt is not None:
+        told = ("terminated", 143) if isinstance(interrupt, Terminated) else ("interrupted", 130)
+        return "; ".join([told[0], *map(str, interrupt.args)]), told[1]
+    if isinstance(error, typer.TyperException):
+        return f"error: {_usage(error)}", 2
+    if isinstance(error, MisstepError):
+        return f"error: {'' if _has_room() else 'out of memory: '}{error}", 2
+    # Libraries that are refused memory raise anything: ImportError, OSError, SystemError ...
+    if isinstance(error, MemoryError) or not _has_room():
+        return "error: out of memory: free some, or give it less to do at a time", 2
+    return None
+
+
+def _has_room() -> bool:
+    """Say whether the system still gives memory to this process."""
+    try:
+        return len(bytearray(_ROOM)) == _ROOM
+    except MemoryError:
+        return False
 
 
 def _tell(message: str, code: int) -> int:

@@ -55,7 +55,8 @@ JsonFile = Annotated[
 ]
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?inf|nan", re.IGNORECASE | re.ASCII)
-_WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
+# Longer ones are numbers with a fraction: no parameter counts so far.
+_WHOLE = re.compile(r"[+-]?\d{1,18}", re.ASCII)
 
 
 def parse_parameters(option: str, texts: Sequence[str] | None) -> dict[str, ParameterValue]:

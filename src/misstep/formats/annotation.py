@@ -90,8 +90,9 @@ def _annotation(said: dict[str, Any]) -> Annotation:
         raise ValueError(f"dt is {dt!r}")
     if failure_step is not None and (type(failure_step) is not int or failure_step < 0):
         raise ValueError(f"failure_step is {failure_step!r}")
-    if not isinstance(said["notes"], list):
-        raise ValueError("notes is no list")
+    for name, kind in (("notes", list), ("parameters", dict)):
+        if not isinstance(said[name], kind):
+            raise ValueError(f"{name} is {type(said[name]).__name__}, not {kind.__name__}")
     provenance = Provenance(
         system=said["system"],
         parameters={name: _from_json(value) for name, value in said["parameters"].items()},

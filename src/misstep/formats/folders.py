@@ -1,17 +1,20 @@
 """Data sets that are folders, written in a single step: the old one or the new one, never half.
 
-The folder is filled under a hidden name beside its place, flushed to the disk, and renamed. An
-old one is renamed away just before: for that instant there is none under the name.
+The folder is filled under a hidden name beside its place, flushed to the disk, and renamed, or
+made to change places with an old one. Only where the system cannot exchange two names is the old
+one renamed away just before, and for that instant there is none under the name.
 """
 
+import ctypes
 import os
-import shutil
-import tempfile
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 from misstep.errors import MisstepError
-from misstep.storage import flush, refusals_told
+from misstep.storage import flush, hidden_folder, refusals_told
+
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # of Linux
 
 
 def write_folder(
@@ -41,19 +44,33 @@ def write_folder(
             "a data set of this format"
         )
     with refusals_told(path):
-        hidden = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent))
-        try:
+        with hidden_folder(target) as hidden:
             new = hidden / target.name
             write(new)
             _flush_all(new)
-            if target.exists():
-                target.replace(hidden / "old")
-            new.replace(target)
-        finally:
-            if (hidden / "old").exists() and not target.exists():
-                (hidden / "old").replace(target)
-            shutil.rmtree(hidden, ignore_errors=True)
+            _put_in_place(new, target, hidden / "old")
         flush(target.parent)
+
+
+def _put_in_place(new: Path, target: Path, old: Path) -> None:
+    if not target.exists():
+        new.replace(target)
+    elif not exchange(new, target):
+        target.replace(old)
+        try:
+            new.replace(target)
+        except BaseException:
+            old.replace(target)
+            raise
+
+
+def exchange(one: Path, other: Path) -> bool:
+    """Let two files or folders change places in a single step; return whether the system did."""
+    rename = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
+    if rename is None:
+        return False
+    names = os.fsencode(one), os.fsencode(other)
+    return bool(rename(_AT_FDCWD, names[0], _AT_FDCWD, names[1], _RENAME_EXCHANGE) == 0)
 
 
 def _is_empty(folder: Path) -> bool:

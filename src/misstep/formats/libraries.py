@@ -3,7 +3,7 @@
 import importlib
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,22 @@ def library_errors(what: str) -> Iterator[None]:
     except Exception as error:  # assertions, struct.error, KeyError ...: it expects no damage
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MisstepError(f"{what} cannot be read ({reason[:_LONGEST_REASON]})") from error
+
+
+def parquet_writer(path: Path, schema: Any, **options: Any) -> Any:
+    """Return a `pyarrow.parquet.ParquetWriter` that tells only once that the disk is full.
+
+    Arrow's own, when it is let go after a write has failed, tries once more to end the file, and
+    Python prints the traceback of that.
+    """
+    from pyarrow import parquet
+
+    class Writer(parquet.ParquetWriter):
+        def __del__(self) -> None:
+            with suppress(OSError):
+                super().__del__()
+
+    return Writer(path, schema, **options)
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -10,15 +10,18 @@ from misstep.mixture import compiled
 
 Array = NDArray[np.float64]
 
+SMALLEST = 1e-300
+"""Variance."""
+
 
 def whiteners_of(matrices: Array) -> Array | None:
     """Return L⁻¹ of each L Lᵀ (K, d, d), or None if one is not definite.
 
     Definite is what is finite, symmetric but for rounding, and not so nearly singular that rounding
-    decides.
+    decides, nor so small that its inverse leaves the range of numbers.
     """
     variances = np.diagonal(matrices, axis1=1, axis2=2)
-    if not np.all(np.isfinite(matrices)) or not np.all(variances > 0.0):
+    if not np.all(np.isfinite(matrices)) or not np.all(variances > SMALLEST):
         return None
     deviations = np.sqrt(variances)
     rounding = 1e-9 * deviations[:, :, None] * deviations[:, None, :]

@@ -175,8 +175,12 @@ class Donut:
         return np.array(rows)
 
     def _evaluate(self, point: Array) -> tuple[float, float, Array]:
-        y = self._whitener @ (point - self.mean)
+        with np.errstate(over="ignore", invalid="ignore"):
+            y = self._whitener @ (point - self.mean)
+            squared = float(y @ y)
+        if not squared < math.inf:
+            return -math.inf, 0.0, np.zeros_like(y)
         value, slope = compiled.donut_log_density(
-            float(y @ y), self._log_norm, *self.shape, self.mean.size
+            squared, self._log_norm, *self.shape, self.mean.size
         )
         return value, slope, self._whitener.T @ y

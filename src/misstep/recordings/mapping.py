@@ -26,6 +26,7 @@ In a file the same is said in TOML ::
 import json
 import math
 import re
+import sys
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -40,6 +41,7 @@ from misstep.storage import write_text
 from misstep.trajectory import Column
 from misstep.units import UNITS
 
+_LARGEST = sys.float_info.max  # a whole number can be larger
 _ITEM = re.compile(
     r"""\s*(?P<name>[^=:,"]+?)\s*
         (?:=\s*(?:"(?P<quoted>[^"]*)"|(?P<source>[^=:,"]+?))\s*)?
@@ -83,9 +85,9 @@ class MappedColumn:
             value = getattr(self, field)
             if isinstance(value, bool) or not isinstance(value, int | float):
                 raise MisstepError(f"column {self.name!r}: {field} is {value!r}, not a number")
-            if not math.isfinite(value) or (field == "factor" and value == 0):
+            if not abs(value) <= _LARGEST or (field == "factor" and value == 0):
                 raise MisstepError(
-                    f"column {self.name!r}: {field} is {value:g}, but must be finite"
+                    f"column {self.name!r}: {field} is {_told(value)}, but must be finite"
                     + (" and not zero" if field == "factor" else "")
                 )
         if not isinstance(self.source, str):
@@ -121,9 +123,9 @@ class ColumnMapping:
         if self.named not in (None, True, False):
             raise MisstepError(f"named is {self.named!r}: it is true or false")
         if self.rate is not None and not (
-            isinstance(self.rate, int | float) and 0 < self.rate < math.inf
+            isinstance(self.rate, int | float) and 0 < self.rate <= _LARGEST
         ):
-            raise MisstepError(f"the rate is {self.rate!r}: it has to be positive, in Hz")
+            raise MisstepError(f"the rate is {_told(self.rate)}: it has to be positive, in Hz")
         for field in ("time", "episode"):
             if not isinstance(getattr(self, field), str):
                 raise MisstepError(f"{field} is {getattr(self, field)!r}: name a column")
@@ -175,6 +177,13 @@ class ColumnMapping:
             provenance=replace(provenance, notes=(*provenance.notes, *notes)),
         )
         return replace(episode, header=header, blocks=_blocks(episode, observations, actions))
+
+
+def _told(value: object) -> str:
+    """Return a value as a message has it."""
+    if isinstance(value, int) and abs(value) > _LARGEST:
+        return "too large"
+    return f"{value:g}" if isinstance(value, int | float) else repr(value)
 
 
 # Applying
@@ -350,10 +359,10 @@ def load_mapping(path: Path) -> ColumnMapping:
         return _from_toml(said)
     except OSError as error:
         raise MisstepError(f"cannot read {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise MisstepError(f"cannot read {path}: it is no TOML ({error})") from error
     except MisstepError as error:
         raise MisstepError(f"cannot read {path}: {error}") from error
+    except (ValueError, RecursionError) as error:  # also of a number with too many digits
+        raise MisstepError(f"cannot read {path}: it is no TOML ({error})") from error
 
 
 def save_mapping(mapping: ColumnMapping, path: Path) -> None:

@@ -15,7 +15,7 @@ from misstep.costs import StateCost
 from misstep.errors import MisstepError
 from misstep.parameters import ParameterValue, build_parameters, check_parameters, parameter
 from misstep.systems.mechanics import Mechanics
-from misstep.systems.system import System
+from misstep.systems.system import System, compiled
 from misstep.trajectory import Column
 
 # The pole's inertia about its own axis, as a share of the one across it. The hinge never turns
@@ -267,7 +267,7 @@ class CartPole(System):
         noise = (p.position_noise, p.velocity_noise, p.angle_noise, p.angular_velocity_noise)
         self._noise = np.array(noise) if any(noise) else None
 
-        self.model = cartpole_spec(p).compile()
+        self.model = compiled(cartpole_spec(p), self.system_id)
         self.data = mujoco.MjData(self.model)
         # Views into MuJoCo's memory, kept because asking for them takes longer than a step.
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
@@ -490,14 +490,19 @@ def wrap_angle(angle: float) -> float:
 
 def _inertia_across(p: CartPoleParameters) -> float:
     """Return the pole's inertia [kg·m²] about its centre of mass, across its length."""
-    return p.pole_inertia or p.pole_mass * p.half_length**2 / 3.0
+    return p.pole_inertia or p.pole_mass * (p.half_length * p.half_length) / 3.0
 
 
 def _fastest_rate(p: CartPoleParameters) -> float:
     """Return the fastest rate [1/s] at which the pole swings or friction brakes, near upright."""
-    coupling = p.pole_mass * p.half_length
+    total, coupling = p.cart_mass + p.pole_mass, p.pole_mass * p.half_length
     about_hinge = _inertia_across(p) + coupling * p.half_length
-    inertia = np.array([[p.cart_mass + p.pole_mass, coupling], [coupling, about_hinge]])
+    inertia = np.array([[total, coupling], [coupling, about_hinge]])
+    if not 0.0 < total * about_hinge - coupling * coupling < math.inf:
+        raise MisstepError(
+            f"{p.owner}: masses of {p.cart_mass:g} and {p.pole_mass:g} kg and a half length of "
+            f"{p.half_length:g} m are too far apart to reckon with"
+        )
     braking = np.linalg.eigvals(
         np.linalg.solve(inertia, np.diag([p.cart_damping, p.hinge_damping]))
     )

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
 from misstep.parameters import check_parameters, parameter, parameter_table
-from misstep.systems.system import System
+from misstep.systems.system import System, compiled
 from misstep.trajectory import Column
 
 
@@ -123,7 +123,7 @@ class StrikingSystem(System):
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, shape=(n,), dtype=np.float64)
         self.action_space = gymnasium.spaces.Box(0.0, p.v_max, shape=(1,), dtype=np.float64)
 
-        self.model = spec.compile()
+        self.model = compiled(spec, self.system_id)
         self.data = mujoco.MjData(self.model)
         self._joints = {
             self.model.joint(i).name: int(self.model.jnt_qposadr[i]) for i in range(self.model.njnt)

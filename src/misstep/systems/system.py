@@ -6,7 +6,7 @@ parameters the same system can be built again.
 """
 
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -102,3 +102,26 @@ class System(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
                 f"{self.system_id}: the action is {number} {unit}, which is not a finite {quantity}"
             )
         return number
+
+
+def compiled(spec: Any, owner: str) -> Any:
+    """Return the model of MuJoCo that a specification describes.
+
+    Parameters
+    ----------
+    spec : mujoco.MjSpec
+    owner : str
+        The system's name, for messages.
+
+    Raises
+    ------
+    MisstepError
+        If MuJoCo finds its numbers impossible: a mass or an inertia too small to move.
+    """
+    try:
+        return spec.compile()
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise MisstepError(
+            f"{owner}: MuJoCo cannot build it with these parameters: {reason}"
+        ) from error

@@ -70,6 +70,8 @@ class Bag:
     def __init__(self, reader: "AnyReader", unpack: Unpack, options: ReadOptions) -> None:
         self._reader, self._unpack, self._options = reader, unpack, options
         self.types = {each.topic: each.msgtype for each in reader.connections}
+        if not all(isinstance(text, str) for pair in self.types.items() for text in pair):
+            raise MisstepError("a topic or its type has no name: it is damaged")
         self._stamp = None if options.time is None else parse_place(f"/any.{options.time}")
 
     def messages(
@@ -84,7 +86,8 @@ class Bag:
         if not connections:
             return
         is_needed = wanted if needed is None or self._stamp else set(needed)
-        total = sum(each.msgcount for each in connections)
+        with library_errors("the number of its messages"):
+            total = sum(each.msgcount for each in connections)
         raw = self._reader.messages(connections)
         done = 0
         while True:
@@ -96,12 +99,15 @@ class Bag:
                 content = None
                 if connection.topic in is_needed:
                     content = self._reader.deserialize(self._unpack(data), connection.msgtype)
-            yield self._time(time, content), connection.topic, content
+                time = self._time(time, content)
+            yield time, connection.topic, content
             done += 1
             if report and self._options.report is not None and done % 1000 == 0:
                 self._options.report(done, max(total, done))
 
     def _time(self, received: int, content: Any) -> int:
+        if not isinstance(received, int):  # SQLite keeps anything anywhere
+            raise MisstepError("the time when it was received is no whole number")
         stamp = None if self._stamp is None else self._stamp.found(content)
         seconds, rest = getattr(stamp, "sec", None), getattr(stamp, "nanosec", 0)
         return received if seconds is None else int(seconds) * 10**9 + int(rest)

@@ -3,11 +3,13 @@
 rosbags unpacks whatever a bag holds in one go. So the functions that it unpacks with are replaced
 by ones that stop: in its table for MCAP, which opening a file goes through already, and in each
 chunk of a ROS 1 bag. Bags of ROS 2 that are packed file by file are measured before; messages that
-are packed one by one are unpacked here.
+are packed one by one are unpacked here. What has no end although it is not packed, refuses
+`misstep.formats.bags.endless`.
 """
 
 import bz2
 import re
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -15,17 +17,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from misstep.errors import MisstepError
+from misstep.formats.bags.endless import check_base, check_types, refuse_endless_texts
 from misstep.formats.libraries import library_errors
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
 _LARGEST_CHUNK = 2**28  # bytes, unpacked
-_LARGEST_YAML = 2**24  # bytes
+_LARGEST_YAML = 2**21  # bytes; about 8 s
 _LONGEST_ARRAY = 2**24  # elements
 _LARGEST_RATIO = 100  # of the size of a file to its packed size; recordings reach 20
 _SMALL = 2**24  # bytes: whatever the ratio, no harm
 
+_SQLITE = b"SQLite format 3\x00"
 # A frame, or one to be skipped.
 _ZSTD = re.compile(rb"\x28\xb5\x2f\xfd|[\x50-\x5f]\x2a\x4d\x18", re.DOTALL)
 
@@ -52,14 +56,17 @@ def opened(path: Path) -> Iterator[tuple["AnyReader", Unpack]]:
         lz4=lambda packed, size: _unpacked(_lz4(), packed, size),
         zstd=lambda packed, size: _unpacked(_zstd(), packed, size),
     )
+    refuse_endless_texts()
     with library_errors("it"):
-        for file in sorted(path.iterdir()) if path.is_dir() else ():
-            _measure(file)
+        for file in sorted(path.iterdir()) if path.is_dir() else (path,):
+            if file.is_file():
+                _check_file(file)
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
     try:
         with library_errors("it"):
             reader.typestore.max_sequence_length = _LONGEST_ARRAY
+            check_types(reader.typestore.fielddefs)
             unpack: Unpack = bytes
             for part in reader.readers:
                 unpack = _bound(part)
@@ -119,14 +126,27 @@ def _unpacked(decompressor: Any, packed: bytes, size: int = _LARGEST_CHUNK) -> b
     return plain
 
 
-def _measure(file: Path) -> None:
-    """Refuse a packed file that would fill the disk, to which it is about to be unpacked."""
+def _check_file(file: Path) -> None:
+    """Refuse a file that would fill the disk or never end."""
     with open(file, "rb") as start:
-        if not _ZSTD.match(start.read(4)):
-            return
+        beginning = start.read(len(_SQLITE))
+    if beginning == _SQLITE:
+        check_base(file)
+    elif _ZSTD.match(beginning):
+        with tempfile.TemporaryDirectory() as folder:
+            plain = Path(folder, file.stem)
+            _unpack_file(file, plain)
+            with open(plain, "rb") as start:
+                is_base = start.read(len(_SQLITE)) == _SQLITE
+            if is_base:
+                check_base(plain)
+
+
+def _unpack_file(file: Path, plain: Path) -> None:
+    """Unpack a file as rosbags is about to, unless it is packed more densely than recordings."""
     most = max(_SMALL, _LARGEST_RATIO * file.stat().st_size)
     size = 0
-    with _zstd_module().open(file, "rb") as unpacked:
+    with _zstd_module().open(file, "rb") as unpacked, open(plain, "wb") as written:
         for piece in iter(partial(unpacked.read, 2**20), b""):
             size += len(piece)
             if size > most:
@@ -134,3 +154,4 @@ def _measure(file: Path) -> None:
                     f"{file.name} unpacks to more than {_LARGEST_RATIO} times its size: if it is "
                     "meant to, unpack it with zstd before"
                 )
+            written.write(piece)

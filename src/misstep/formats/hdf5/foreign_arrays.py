@@ -89,6 +89,7 @@ class ForeignArray:
         if math.prod(dataset.shape[1:]) * dataset.dtype.itemsize > _LARGEST_ROW:
             raise MisstepError(f"{name} has rows of shape {dataset.shape[1:]}: that is too much")
         self._filters: list[int] | None = None
+        self._unpacked: tuple[tuple[int, ...], NDArray[Any]] | None = None  # the last chunk
         if dataset.chunks is None:
             if dataset.id.get_storage_size() < dataset.nbytes:
                 raise MisstepError(f"{name} claims to be longer than what is stored of it")
@@ -133,7 +134,10 @@ class ForeignArray:
             *(range(0, n, c) for n, c in zip(self.shape[1:], chunk[1:], strict=True)),
         ]
         for corner in itertools.product(*corners):
-            block = self._chunk(corner)
+            if self._unpacked is None or self._unpacked[0] != corner:
+                self._unpacked = None  # before there is another one in memory
+                self._unpacked = corner, self._chunk(corner)
+            block = self._unpacked[1]
             first, last = max(corner[0], start), min(corner[0] + chunk[0], stop)
             rest = tuple(
                 slice(at, min(at + c, n))

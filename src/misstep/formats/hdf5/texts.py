@@ -14,14 +14,18 @@ import h5py
 from misstep.errors import MisstepError
 from misstep.formats.hdf5.attributes import damage
 
-_SECONDS = 20
+_SECONDS = 60  # on a machine that may do other things, too
+_COMPUTING_SECONDS = 20
 _LARGEST = 2**24  # bytes of all texts
 _LIMITS = """
 import os, sys
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # each thread asks for memory in advance
 try:
     import resource
-    resource.setrlimit(resource.RLIMIT_AS, (2**33, 2**33))
+    for kind, most in ((resource.RLIMIT_AS, 2**33), (resource.RLIMIT_CPU, int(sys.argv[-1]))):
+        hard = resource.getrlimit(kind)[1]
+        most = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        resource.setrlimit(kind, (most, most))
 except ImportError:  # Windows
     pass
 """
@@ -30,7 +34,7 @@ import json
 import h5py, numpy
 with h5py.File(sys.argv[1], "r") as file:
     owner = file[sys.argv[2]]
-    found = owner.attrs[sys.argv[3]] if len(sys.argv) > 3 else owner[()]
+    found = owner.attrs[sys.argv[3]] if len(sys.argv) > 4 else owner[()]
 texts = [t.decode() if isinstance(t, bytes) else str(t) for t in numpy.atleast_1d(found).ravel()]
 sys.stdout.write(json.dumps(texts))
 """
@@ -100,9 +104,10 @@ def _read_apart(path: Path, what: str, arguments: list[str]) -> list[str]:
 
 
 def _run_apart(path: Path, what: str, script: str, arguments: list[str]) -> bytes:
+    words = [str(path.resolve()), *arguments, str(_COMPUTING_SECONDS)]
     try:
         return subprocess.run(  # noqa: S603 our own interpreter and script
-            [sys.executable, "-I", "-c", _LIMITS + script, str(path.resolve()), *arguments],
+            [sys.executable, "-I", "-c", _LIMITS + script, *words],
             capture_output=True,
             timeout=_SECONDS,
             check=True,

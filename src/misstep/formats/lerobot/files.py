@@ -30,7 +30,15 @@ def damage(what: str) -> Iterator[None]:
         yield
     except MisstepError:
         raise
-    except (pa.ArrowException, OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+    except (
+        pa.ArrowException,
+        ArithmeticError,
+        KeyError,
+        OSError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as error:
         reason = " ".join(str(error).split())
         raise MisstepError(f"{what} is damaged ({reason[:300]})") from error
 

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -26,6 +27,7 @@ from misstep.formats.format import (
 )
 from misstep.formats.guard import prefixed
 from misstep.formats.lerobot.files import REWARD, SUCCESS, damage, read_lines
+from misstep.formats.lerobot.footer import column_parts
 from misstep.formats.libraries import needed, read_json
 from misstep.trajectory import Column, Outcome, Provenance
 
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
     from pyarrow import parquet
 
 _WIDEST = 10**5  # numbers in one feature
+_MOST_NUMBERS = 2**22  # in the rows that are read at a time
 _TOLERANCE = 1e-3  # s, of time stamps; LeRobot's own is 1e-4, and they are float32
 _NUMBERS = re.compile(r"(float|u?int)(8|16|32|64)|bool")
 _INDEX = ("episode_index", "frame_index", "timestamp", "task_index")
@@ -100,7 +103,11 @@ def _info(said: dict[str, Any]) -> _Info:
     if not re.match(r"v?[23]\.", version):
         raise MisstepError(f"info.json says codebase_version {version}: 2.x and 3.x are read")
     rate, features = said.get("fps"), said.get("features")
-    if not isinstance(rate, int | float) or isinstance(rate, bool) or not 0 < rate < math.inf:
+    if (
+        not isinstance(rate, int | float)
+        or isinstance(rate, bool)
+        or not 0 < rate <= sys.float_info.max
+    ):
         raise MisstepError(f"info.json says fps {rate!r}: it has to be a positive number")
     if not isinstance(features, dict):
         raise MisstepError("info.json names no features")
@@ -233,11 +240,29 @@ def _pieces(
             missing = {*wanted, "episode_index"} - there
             if missing:
                 raise MisstepError(f"{place} has no column {min(missing)!r}")
-            for batch in file.iter_batches(BLOCK_ROWS, columns=wanted, use_threads=False):
+            widths = {f.key: f.width for f in (*info.observations, *info.actions)}
+            _check_lengths(path, widths)
+            rows = max(1, min(BLOCK_ROWS, _MOST_NUMBERS // sum(widths.values())))
+            for batch in file.iter_batches(rows, columns=wanted, use_threads=False):
                 yield from _pieces_of(batch, info)
             file.close()
         if options.report is not None:
             options.report(done, len(files))
+
+
+def _check_lengths(path: Path, widths: dict[str, int]) -> None:
+    """Refuse lists that are longer than they have to be: equal numbers take up no space."""
+    for part in column_parts(path):
+        key = next((key for key in widths if _is_part(part.path, key)), None)
+        if key is not None and part.values > part.rows * widths[key]:
+            raise MisstepError(
+                f"column {key!r} has {part.values} numbers in {part.rows} rows: "
+                f"info.json says {widths[key]} in each"
+            )
+
+
+def _is_part(path: str, key: str) -> bool:
+    return path == key or path.startswith(f"{key}.")
 
 
 def _pieces_of(batch: "pa.RecordBatch", info: _Info) -> Iterator[tuple[int, _Piece]]:

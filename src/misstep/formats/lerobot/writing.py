@@ -15,7 +15,7 @@ from misstep.formats.folders import write_folder
 from misstep.formats.format import Episode, FloatArray, Header
 from misstep.formats.guard import prefixed
 from misstep.formats.lerobot.files import DONE, REWARD, SUCCESS, damage, recognise
-from misstep.formats.libraries import needed
+from misstep.formats.libraries import needed, parquet_writer
 from misstep.formats.steps import dt_of, steps_of, uniform
 from misstep.trajectory import Outcome
 
@@ -362,9 +362,7 @@ class _Writer30(_Writer):
 
 
 def _parquet_writer(path: Path, table: "pa.Table") -> "parquet.ParquetWriter":
-    from pyarrow import parquet
-
-    return parquet.ParquetWriter(path, table.schema, compression="snappy")
+    return parquet_writer(path, table.schema, compression="snappy")
 
 
 def _write_tasks(path: Path, tasks: dict[str, int]) -> None:

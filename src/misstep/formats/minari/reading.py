@@ -109,12 +109,14 @@ class _Reader:
         with library_errors("it"):
             (said,) = self._dataset.storage.get_episode_metadata([index])
             (data,) = self._dataset.iterate_episodes([index])
+        if not isinstance(said, dict):
+            raise MisstepError("what is said of it is no JSON object")
         annotation = _annotation(said)
         observations = flat(self._dataset.observation_space, data.observations, "observation")
         actions = flat(self._dataset.action_space, data.actions, "action")
         rewards = _vector(data.rewards, "rewards")
         steps = said.get("total_steps", len(rewards))
-        if steps != len(rewards):
+        if not np.array_equal(steps, len(rewards)):  # an attribute can be a whole table
             raise MisstepError(
                 f"total_steps is {steps}, but minari reads {len(rewards)}: it is damaged, or "
                 "longer than Minari's arrow storage can read"

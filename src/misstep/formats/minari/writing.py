@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 import shutil
 from collections.abc import Iterable, Iterator
 from functools import partial
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 _ARROW_ROWS = 2**15  # that the library reads back of an episode
 _LONGEST_TEXT = 64000  # bytes of an attribute in HDF5
 _SPARE = 2**24  # bytes of free disk that writing leaves
+_REFUSAL = re.compile("error message = '([^']*)'")  # how the HDF5 library tells of a full disk
 
 
 def write(path: Path, episodes: Iterable[Episode], storage: str = "hdf5") -> None:
@@ -49,7 +51,14 @@ def write(path: Path, episodes: Iterable[Episode], storage: str = "hdf5") -> Non
     target = Path(located(path))
     if target != path:
         target.parent.mkdir(parents=True, exist_ok=True)  # as Minari makes its namespaces
-    write_folder(target, partial(_fill, path=target, episodes=episodes, storage=storage), recognise)
+    fill = partial(_fill, path=target, episodes=episodes, storage=storage)
+    try:
+        write_folder(target, fill, recognise)
+    except RuntimeError as error:
+        reason = _REFUSAL.search(str(error))
+        if reason is None:
+            raise
+        raise MisstepError(f"cannot write {path}: {reason[1]}") from error
 
 
 def _fill(folder: Path, path: Path, episodes: Iterable[Episode], storage: str) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from misstep.errors import MisstepError
 from misstep.formats.format import BLOCK_ROWS, Episode, FloatArray, Format, ReadOptions
 from misstep.formats.guard import prefixed
-from misstep.formats.libraries import needed
+from misstep.formats.libraries import needed, parquet_writer
 from misstep.formats.tables.table import (
     ANNOTATION,
     EPISODE,
@@ -43,11 +43,26 @@ def read(path: Path, options: ReadOptions) -> Iterator[Episode]:
     if not path.is_file():
         raise MisstepError("it is a folder or a device; name a file")
     try:
-        with arrow.parquet.ParquetFile(path, pre_buffer=False) as file:
+        with _opened(arrow, path) as file:
             reader = _RowReader(arrow, file, options)
             yield from read_table(Table(reader.cells, True, "row", reader.rows), options)
     except (arrow.ArrowException, OSError, UnicodeDecodeError, MemoryError) as error:
         raise MisstepError(f"it is damaged ({' '.join(str(error).split())})") from error
+
+
+def _opened(arrow: Any, path: Path) -> Any:
+    """Open a file so that a text that stands in many rows is in memory once."""
+    with arrow.parquet.ParquetFile(path, pre_buffer=False) as file:
+        schema = file.schema_arrow
+    texts = [field.name for field in schema if _is_text(arrow, field.type)]
+    return arrow.parquet.ParquetFile(path, pre_buffer=False, read_dictionary=texts)
+
+
+def _is_text(arrow: Any, kind: Any) -> bool:
+    types = arrow.types
+    if types.is_dictionary(kind):
+        kind = kind.value_type
+    return bool(types.is_string(kind) or types.is_large_string(kind))
 
 
 class _RowReader:
@@ -84,20 +99,32 @@ class _RowReader:
             return self._float64(column.cast("int64")) * _SECONDS[kind.unit]
         if types.is_floating(kind) or types.is_integer(kind) or types.is_boolean(kind):
             return self._float64(column)
-        raise MisstepError(f"column {name!r} holds {kind}: numbers are needed")
+        held = kind.value_type if types.is_dictionary(kind) else kind
+        raise MisstepError(f"column {name!r} holds {held}: numbers are needed")
 
     def _key_numbers(self, batch: Any, name: str) -> FloatArray:
-        if not self._is_text(batch.column(name).type):
+        if not _is_text(self._arrow, batch.column(name).type):
             return self._numbers(batch, name)
-        return np.array([self._keys.number(text) for text in self._texts(batch, name)])
+        words, places = self._words(batch, name)
+        numbers: dict[int, float] = {}
+        for place in places:
+            if place not in numbers:
+                numbers[place] = self._keys.number(words[place])
+        return np.array([numbers[place] for place in places])
 
     def _texts(self, batch: Any, name: str) -> list[str]:
-        if not self._is_text(batch.column(name).type):
-            raise MisstepError(f"column {name!r} holds {batch.column(name).type}: not texts")
-        return [text or "" for text in batch.column(name).to_pylist()]
+        words, places = self._words(batch, name)
+        return [words[place] for place in places]
 
-    def _is_text(self, kind: Any) -> bool:
-        return bool(self._arrow.types.is_string(kind) or self._arrow.types.is_large_string(kind))
+    def _words(self, batch: Any, name: str) -> tuple[list[str], list[int]]:
+        """Return the texts that there are, and which of them stands in each row."""
+        column = batch.column(name)
+        if not _is_text(self._arrow, column.type):
+            raise MisstepError(f"column {name!r} holds {column.type}: not texts")
+        if not self._arrow.types.is_dictionary(column.type):
+            column = column.dictionary_encode()
+        words = [text or "" for text in column.dictionary.to_pylist()]
+        return [*words, ""], column.indices.fill_null(len(words)).to_pylist()
 
     def _float64(self, column: Any) -> FloatArray:
         plain = column.cast("float64", safe=False)
@@ -120,7 +147,7 @@ def write(path: Path, episodes: Iterable[Episode]) -> None:
             for header, rows in _grouped(written_rows(episodes)):
                 if writer is None:
                     schema = _schema(arrow, cells_of(header))
-                    writer = arrow.parquet.ParquetWriter(temporary, schema)
+                    writer = parquet_writer(temporary, schema)
                 writer.write_table(_table(arrow, schema, rows))
         finally:
             if writer is not None:
