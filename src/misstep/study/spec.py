@@ -239,7 +239,7 @@ def load_study(path: str | os.PathLike[str]) -> Study:
         values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise MisstepError(f"cannot read {path}: {error.strerror}") from error
-    except ValueError as error:  # TOML and UTF-8 alike
+    except (ValueError, RecursionError) as error:  # TOML and UTF-8 alike
         raise MisstepError(f"{path} is not valid TOML: {error}") from error
     with _inside(str(path)):
         return _read_study(values)
