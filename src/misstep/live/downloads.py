@@ -8,15 +8,12 @@ from typing import Any
 
 from misstep.errors import MisstepError
 from misstep.formats import FORMATS
+from misstep.live.packing import PACKED
 from misstep.live.worker import Worker
 from misstep.trajectory import Trajectory
 
 MOST_UPLOADED = 64 * 2**20
 """Bytes of a file that is dropped in."""
-
-
-PACKED = ".zip"
-"""Suffix of a folder that is packed into a file, for the formats that are folders."""
 
 
 def show_formats() -> list[dict[str, Any]]:

@@ -4,8 +4,6 @@ Each job takes plain values and paths that the server has made, never a name fro
 """
 
 import shutil
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,8 +14,8 @@ from misstep.errors import MisstepError
 from misstep.formats import FORMATS, load_dataset, save_dataset
 from misstep.learners import Task
 from misstep.learning import learn, resume
-from misstep.live.downloads import PACKED
 from misstep.live.narration import tell_trial
+from misstep.live.packing import PACKED, unpacked
 from misstep.live.picture import show_mixture, show_recording, show_summary, still_columns, to_json
 from misstep.runs import Run, load_run
 from misstep.systems import System, make_system
@@ -25,7 +23,6 @@ from misstep.trajectory import Dataset, Trajectory
 
 MOST_STEPS = 300_000
 """Of all recordings in a file that is dropped in: 100 minutes at 50 Hz."""
-_MOST_UNPACKED, _MOST_PACKED = 512 * 2**20, 5000  # bytes; files
 
 Tell = Callable[[str, Any], None]
 """``tell(kind, value)``: tell the server something while the job goes on."""
@@ -117,7 +114,7 @@ def read_upload(
     driven = make_system(system, **parameters)
     source = Path(path)
     if source.suffix == PACKED:
-        source = _unpacked(source)
+        source = unpacked(source)
     dataset = load_dataset(source)
     steps = sum(trajectory.n_steps for trajectory in dataset)
     if steps > MOST_STEPS:
@@ -183,27 +180,6 @@ def _teller(system: System, tell: Tell, ask: Ask) -> Callable[[Run], None]:
             raise _HaltError
 
     return on_trial
-
-
-def _unpacked(packed: Path) -> Path:
-    """Unpack a folder beside the file that it was packed into, and return where it begins.
-
-    Names that lead out of the folder are no concern: `zipfile` leaves such parts of them out.
-    """
-    folder = packed.with_suffix("")
-    try:
-        with zipfile.ZipFile(packed) as archive:
-            size = sum(entry.file_size for entry in archive.infolist())
-            if size > _MOST_UNPACKED or len(archive.infolist()) > _MOST_PACKED:
-                raise MisstepError(
-                    f"unpacked it is larger than {_MOST_UNPACKED // 2**20} MB or has more than "
-                    f"{_MOST_PACKED} files: use `misstep convert` on the command line"
-                )
-            archive.extractall(folder)
-    except (zipfile.BadZipFile, zlib.error, RuntimeError, OSError, EOFError) as error:
-        raise MisstepError(f"it is no zip file that can be unpacked: {error}") from error
-    inside = list(folder.iterdir()) if folder.exists() else []
-    return inside[0] if len(inside) == 1 else folder
 
 
 def _system_of(dataset: Dataset) -> System:
