@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 OUT ?= out/paper
 
-.PHONY: demo test check nightly format gazebo clean
+.PHONY: demo test check nightly audit format gazebo clean
 
 demo: $(READY)  ## The paper, from five sets of failed demonstrations; ends with the report's path.
 	$(BIN)/misstep reproduce --quick --out $(OUT)
@@ -25,6 +25,10 @@ check: $(READY)  ## Lint, format, types, imports, the documentation, instruction
 
 nightly: $(READY)  ## Mixtures and donuts against sixty digits, 10,000 examples of each property.
 	HYPOTHESIS_PROFILE=nightly $(BIN)/pytest tests/test_numerical_stress.py
+
+audit: $(READY)  ## Known flaws of the dependencies, from a service on the network.
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check pip-audit
+	$(BIN)/pip-audit --strict -r constraints.txt
 
 format: $(READY)  ## Mend what can be mended by a machine.
 	$(BIN)/ruff check --fix .

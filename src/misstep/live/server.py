@@ -379,6 +379,7 @@ async def _hear(socket: WebSocket, session: Session, page: Page) -> str:
 
 def address(host: str, port: int, token: str) -> str:
     """Return the address of the page, as a browser on this machine takes it."""
-    shown = "127.0.0.1" if host in ("0.0.0.0", "::", "localhost") else host  # noqa: S104
+    everywhere = ("0.0.0.0", "::", "localhost")  # noqa: S104 - compared with, not bound to
+    shown = "127.0.0.1" if host in everywhere else host
     bracketed = f"[{shown}]" if ":" in shown else shown
     return f"http://{bracketed}:{port}/{token}/"

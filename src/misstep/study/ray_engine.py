@@ -119,7 +119,9 @@ def _check_cluster(address: str) -> None:
         "or leave --address out to use this machine"
     )
     try:
-        probe = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE)  # noqa: S603
+        probe = subprocess.run(  # noqa: S603 - our own words
+            words, capture_output=True, text=True, timeout=PATIENCE
+        )
     except subprocess.TimeoutExpired as error:
         raise MisstepError(
             f"no Ray cluster answers at {address} within {PATIENCE:g} s: {hint}"
