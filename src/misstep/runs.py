@@ -52,6 +52,8 @@ _CONFIG_KINDS = {
 }
 _JSON_NAMES = {str: "string", dict: "object", list: "array", int: "whole number", bool: "boolean"}
 
+_KINDS = "biufU"
+"""Of NumPy's types: truth values, numbers, texts."""
 # What zipfile and NumPy raise when an npz file is damaged, depending on where.
 _DAMAGE = (
     EOFError,
@@ -281,6 +283,10 @@ def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
             if sum(entry.file_size for entry in archive.infolist()) > _LARGEST_POLICY:
                 raise MisstepError(f"{path} unpacks to more than any policy holds")
         with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+            arrays = {name: archive[name] for name in archive.files}
     except _DAMAGE as error:
         raise MisstepError(f"cannot read {path}: {' '.join(str(error).split())}") from error
+    for name, array in arrays.items():
+        if array.dtype.kind not in _KINDS:
+            raise MisstepError(f"{path}: {name} holds {array.dtype}, which no policy is made of")
+    return arrays
