@@ -328,7 +328,7 @@ def nearest_maximum(precise, a, unit):
     parameters=conditionals(st.integers(1, 4)),
     exploration=EXPLORATIONS,
     warm=st.booleans(),
-    distance=st.floats(0, 11),
+    distance=st.floats(0, 6),
 )
 def test_mode_of_one_donut(parameters, exploration, warm, distance):
     one = Parameters(np.ones(1), parameters.means[:1], parameters.covariances[:1])
@@ -365,7 +365,7 @@ def test_mode_of_one_donut(parameters, exploration, warm, distance):
     exploration=EXPLORATIONS,
     seed=SEEDS,
     warm=st.booleans(),
-    distance=st.floats(0, 11),
+    distance=st.floats(0, 6),
 )
 def test_mode_over_one_action(parameters, exploration, seed, warm, distance):
     mixture, precise = accepted_donut(parameters, exploration)
