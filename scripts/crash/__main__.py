@@ -23,6 +23,7 @@ from jobs import CONVERSIONS, LEARNERS, ConvertJob, Job, LearnJob, StudyJob, mak
 from nursery import Nursery
 from served import LiveJob, ServeJob
 
+from misstep.cli.interruption import interruptible
 from misstep.cli.output import print_table, write_result
 from misstep.cli.progress import progress
 
@@ -140,4 +141,5 @@ def _print(done: list[Kill], ways: list[str]) -> None:
 
 if __name__ == "__main__":
     os.umask(0o022)
-    sys.exit(main())
+    with interruptible():  # or its disk would stay mounted
+        sys.exit(main())

@@ -43,7 +43,7 @@ _GOODBYES: dict[str, tuple[tuple[int, ...], str]] = {
 }
 """Exit codes and the one line on stderr."""
 
-_OTHERS = re.compile(r"^OpenBLAS|in spawn_main", re.MULTILINE)
+_OTHERS = re.compile(r"^OpenBLAS|^Process SpawnProcess|in spawn_main", re.MULTILINE)
 
 _TOLD = {
     FULL: r"cannot (write|make).*No space left on device",
