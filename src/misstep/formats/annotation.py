@@ -79,7 +79,7 @@ def read_annotation(text: str) -> Annotation:
         if said["misstep"] > _VERSION:
             raise MisstepError("misstep's annotation is of a newer misstep: install that")
         return _annotation(said)
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
+    except (ArithmeticError, KeyError, TypeError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise MisstepError(f"misstep's annotation is damaged ({reason})") from error
 
