@@ -6,6 +6,7 @@ time, or none at all, `RobotClient.ask` returns the safe one by itself.
 
 import os
 import time
+from contextlib import suppress
 from typing import Any, Self
 
 import numpy as np
@@ -206,7 +207,9 @@ class RobotClient:
     def _ask_json(self, message: bytes, answer: Kind) -> dict[str, Any]:
         deadline = time.monotonic() + self._timeout
         try:
-            self._link.send(message)
+            # Who refuses a client may have hung up before it speaks; why is still to be read.
+            with suppress(ConnectionError):
+                self._link.send(message)
             while True:
                 reply = self._link.receive(remaining(deadline))
                 if kind_of(reply) == Kind.REFUSED:

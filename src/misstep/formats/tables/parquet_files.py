@@ -123,8 +123,11 @@ class _RowReader:
             raise MisstepError(f"column {name!r} holds {column.type}: not texts")
         if not self._arrow.types.is_dictionary(column.type):
             column = column.dictionary_encode()
-        words = [text or "" for text in column.dictionary.to_pylist()]
-        return [*words, ""], column.indices.fill_null(len(words)).to_pylist()
+        words = [*(text or "" for text in column.dictionary.to_pylist()), ""]
+        places = column.indices.fill_null(len(words) - 1).to_pylist()
+        if not all(0 <= place < len(words) for place in places):
+            raise MisstepError(f"column {name!r} is damaged: a row has a text that is not there")
+        return words, places
 
     def _float64(self, column: Any) -> FloatArray:
         plain = column.cast("float64", safe=False)
