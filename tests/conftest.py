@@ -7,6 +7,7 @@ import pytest
 from hypothesis import settings
 
 from misstep import MisstepError, demonstrate, make_system
+from misstep.learners import LEARNERS
 
 settings.register_profile("default", deadline=None, derandomize=True, max_examples=100)
 settings.register_profile("nightly", deadline=None, max_examples=10_000)
@@ -41,6 +42,16 @@ def random_mixture():
         return rng.dirichlet(np.full(K, 3.0)), spread * rng.normal(size=(K, d)), covariances
 
     return draw
+
+
+@pytest.fixture
+def scripted(monkeypatch):
+    """A learner whose policies answer what a test says."""
+    from robots import scripted_learner
+
+    kind = scripted_learner()
+    monkeypatch.setitem(LEARNERS._own, "scripted", kind)
+    return kind.scripted
 
 
 @pytest.fixture(scope="session")

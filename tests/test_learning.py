@@ -11,6 +11,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 from scipy.stats import binomtest
+from trials import timeless
 
 from misstep import (
     Dataset,
@@ -38,11 +39,6 @@ class Idle:
 
     def __call__(self, observation):
         return np.zeros(1)
-
-
-def timeless(trials):
-    """Return trials without the time of day, which may differ."""
-    return [replace(t, provenance=replace(t.provenance, time="")) for t in trials]
 
 
 def assert_same_policies(one, other):

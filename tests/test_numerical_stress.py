@@ -717,6 +717,23 @@ def test_an_action_where_squares_overflow(distance):
     np.testing.assert_array_equal(explorations, 1.0)
 
 
+@pytest.mark.parametrize(("distance", "d"), [(1e150, 2), (1e160, 2), (1e300, 2), (1e300, 4)])
+def test_a_spread_that_leaves_the_range_of_numbers(distance, d):
+    joint = draw(np.random.default_rng(0), d=d, K=3, condition=1.0, exponent=0)
+    model = GaussianMixture.from_parameters(*joint)
+    for state in (distance, -distance):
+        variance = model.condition([0], [state]).variance
+        assert not np.isnan(variance).any()
+        assert np.all(np.diag(variance) > 0.0)
+        assert exploration_from_variance(variance, np.ones(d - 1)) <= 1.0
+        for formula in ("prose", "printed"):
+            query = DonutQuery(Conditioner(model, [0]), np.ones(d - 1), formula=formula)
+            action, exploration = query.modes([[state]])
+            assert np.isfinite(action).all()
+            expected = exploration_from_variance(variance, np.ones(d - 1), formula)
+            np.testing.assert_allclose(exploration, expected, rtol=1e-9)
+
+
 @pytest.mark.parametrize("gap", [0.0, 1e-16, 1e-15])
 def test_a_singular_covariance(refused, gap):
     singular = np.array([[1.0, 1.0 - gap], [1.0 - gap, 1.0]]) * np.outer(

@@ -16,10 +16,10 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
-from robots import NASTY, Actuator, Clock, scripted_learner
+from robots import NASTY, Actuator, Clock
+from trials import timeless
 
 from misstep import MisstepError, demonstrate, learn, load_dataset, load_run, make_system
-from misstep.learners import LEARNERS
 from misstep.learning import begin
 from misstep.robot.cadence import Cadence
 from misstep.robot.guard import Command, Safety, State
@@ -37,18 +37,6 @@ PERIOD = 0.02
 @pytest.fixture(scope="module")
 def short():
     return make_system("cartpole", duration=2.0)
-
-
-@pytest.fixture
-def scripted(monkeypatch):
-    """A learner whose policies answer what a test says."""
-    kind = scripted_learner()
-    monkeypatch.setitem(LEARNERS._own, "scripted", kind)
-    return kind.scripted
-
-
-def timeless(trials):
-    return [replace(t, provenance=replace(t.provenance, time="")) for t in trials]
 
 
 class Robot:

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from robots import NASTY, Clock, scripted_learner
+from robots import NASTY, Clock
+from trials import timeless
 
 from misstep import MisstepError, learn, load_run, make_system
 from misstep.cli import main
-from misstep.learners import LEARNERS
 from misstep.learning import begin
 from misstep.robot.addresses import TOKEN, parse_address
 from misstep.robot.client import RobotClient, drive
@@ -59,17 +59,6 @@ TRANSPORTS = ("unix", "tcp", "websocket")
 @pytest.fixture(scope="module")
 def short():
     return make_system("cartpole", duration=1.0)
-
-
-@pytest.fixture
-def scripted(monkeypatch):
-    kind = scripted_learner()
-    monkeypatch.setitem(LEARNERS._own, "scripted", kind)
-    return kind.scripted
-
-
-def timeless(trials):
-    return [replace(t, provenance=replace(t.provenance, time="")) for t in trials]
 
 
 def until(condition):

@@ -17,6 +17,11 @@ class MisstepError(ValueError):
         super().__init__(_one_line(str(message)))
 
 
+def reason_of(error: BaseException) -> str:
+    """Return what an error of somebody else's says, in one line; its type where it says nothing."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
 def _one_line(text: str) -> str:
     if len(text) > _LONGEST:
         half = _LONGEST // 2

@@ -17,7 +17,8 @@ P = TypeVar("P")
 ParameterValue = float | int | bool | str
 """What one parameter can hold; exactly what a file or a command line can hold too."""
 
-_LARGEST = sys.float_info.max  # a whole number of Python's can be larger
+LARGEST = sys.float_info.max
+"""Number that a double can hold; a whole number of Python's can be larger."""
 _KIND_OF = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
 
 
@@ -124,7 +125,7 @@ def check_parameters(parameters: Any, owner: str) -> None:
 def _of_type(f: Field[Any], value: object, owner: str) -> ParameterValue:
     wanted: Any = f.type
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    finite = number and -_LARGEST <= value <= _LARGEST  # type: ignore[operator]
+    finite = number and -LARGEST <= value <= LARGEST  # type: ignore[operator]
     if wanted is float and finite:
         return float(value)  # type: ignore[arg-type]
     if wanted is int and finite and value == int(value):  # type: ignore[call-overload]

@@ -25,7 +25,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from misstep.errors import MisstepError
+from misstep.errors import MisstepError, reason_of
 from misstep.formats import load_dataset, save_dataset
 from misstep.learners import LEARNERS, LearnedPolicy, Learner, Task
 from misstep.parameters import ParameterValue, build_parameters
@@ -225,7 +225,7 @@ def load_run(folder: str | os.PathLike[str]) -> Run:
         except KeyError as error:
             raise MisstepError(f"{path}: policies/{name}.npz lacks the array {error}") from error
         except (TypeError, ValueError) as error:
-            reason = " ".join(str(error).split())
+            reason = reason_of(error)
             raise MisstepError(f"{path}: policies/{name}.npz holds no policy: {reason}") from error
         run.trials.append(load_dataset(file)[0])
     return run
@@ -285,7 +285,7 @@ def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
     except _DAMAGE as error:
-        raise MisstepError(f"cannot read {path}: {' '.join(str(error).split())}") from error
+        raise MisstepError(f"cannot read {path}: {reason_of(error)}") from error
     for name, array in arrays.items():
         if array.dtype.kind not in _KINDS:
             raise MisstepError(f"{path}: {name} holds {array.dtype}, which no policy is made of")

@@ -13,6 +13,7 @@ from misstep.cli.options import (
     Cost,
     Failure,
     JsonFile,
+    LearnerParameters,
     Seed,
     Success,
     SystemName,
@@ -74,12 +75,7 @@ def learn(
             "system were recorded with; repeatable.",
         ),
     ] = None,
-    with_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--with", metavar="NAME=VALUE", help="A parameter of the learner; repeatable."
-        ),
-    ] = None,
+    with_: LearnerParameters = None,
     success: Success = None,
     failure: Failure = None,
     cost: Cost = None,

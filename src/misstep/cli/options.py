@@ -20,6 +20,21 @@ SystemParameters = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE", help="A parameter of the system; repeatable."),
 ]
+LearnerParameters = Annotated[
+    list[str] | None,
+    typer.Option("--with", metavar="NAME=VALUE", help="A parameter of the learner; repeatable."),
+]
+ServedRun = Annotated[
+    Path, typer.Argument(metavar="RUN", help="A run, or with --from a new folder for one.")
+]
+NewRunFrom = Annotated[
+    Path | None,
+    typer.Option("--from", metavar="FILE", help="Begin a new run from these demonstrations."),
+]
+NewRunLearner = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="Of a new run.", show_default="as `misstep learn`"),
+]
 Success = Annotated[
     str | None,
     typer.Option(

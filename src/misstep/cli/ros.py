@@ -13,7 +13,10 @@ from misstep.cli.options import (
     Cost,
     Failure,
     JsonFile,
+    NewRunFrom,
+    NewRunLearner,
     Seed,
+    ServedRun,
     Success,
     SystemName,
     SystemParameters,
@@ -192,22 +195,14 @@ def control(
 
 def explore(
     context: typer.Context,
-    folder: Annotated[
-        Path, typer.Argument(metavar="RUN", help="A run, or with --from a new folder for one.")
-    ],
-    demonstrations: Annotated[
-        Path | None,
-        typer.Option("--from", metavar="FILE", help="Begin a new run from these demonstrations."),
-    ] = None,
+    folder: ServedRun,
+    demonstrations: NewRunFrom = None,
     system: Annotated[str, typer.Option(metavar="NAME", help="Of a new run.")] = "cartpole",
     set_: SystemParameters = None,
     success: Success = None,
     failure: Failure = None,
     cost: Cost = None,
-    learner: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Of a new run.", show_default="as `misstep learn`"),
-    ] = None,
+    learner: NewRunLearner = None,
     with_: With = None,
     state: Annotated[
         str | None, typer.Option(metavar="NAMES", help="Of a new run: columns of the policy.")

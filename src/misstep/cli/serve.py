@@ -17,6 +17,10 @@ from misstep.cli.options import (
     Cost,
     Failure,
     JsonFile,
+    LearnerParameters,
+    NewRunFrom,
+    NewRunLearner,
+    ServedRun,
     Success,
     parse_names,
     parse_parameters,
@@ -38,13 +42,8 @@ _LOOK = 0.1  # s, between two looks at whether a key was pressed or the run is f
 
 
 def serve(
-    folder: Annotated[
-        Path, typer.Argument(metavar="RUN", help="A run, or with --from a new folder for one.")
-    ],
-    demonstrations: Annotated[
-        Path | None,
-        typer.Option("--from", metavar="FILE", help="Begin a new run from these demonstrations."),
-    ] = None,
+    folder: ServedRun,
+    demonstrations: NewRunFrom = None,
     system: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Of a new run: the system that describes the robot."),
@@ -56,16 +55,8 @@ def serve(
     success: Success = None,
     failure: Failure = None,
     cost: Cost = None,
-    learner: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Of a new run.", show_default="as `misstep learn`"),
-    ] = None,
-    with_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--with", metavar="NAME=VALUE", help="A parameter of the learner; repeatable."
-        ),
-    ] = None,
+    learner: NewRunLearner = None,
+    with_: LearnerParameters = None,
     state: Annotated[
         str | None,
         typer.Option(metavar="NAMES", help="Of a new run: columns that the policy may depend on."),

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
-from misstep.errors import MisstepError
+from misstep.errors import MisstepError, reason_of
 from misstep.formats.format import Ending, Header
 from misstep.trajectory import Column, Outcome, Provenance
 
@@ -80,7 +80,7 @@ def read_annotation(text: str) -> Annotation:
             raise MisstepError("misstep's annotation is of a newer misstep: install that")
         return _annotation(said)
     except (ArithmeticError, KeyError, TypeError, ValueError, RecursionError) as error:
-        reason = " ".join(str(error).split())
+        reason = reason_of(error)
         raise MisstepError(f"misstep's annotation is damaged ({reason})") from error
 
 

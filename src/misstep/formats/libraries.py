@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from misstep.errors import MisstepError
+from misstep.errors import MisstepError, reason_of
 
 _LONGEST_REASON = 300  # characters
 _LARGEST_JSON = 2**26  # bytes
@@ -47,7 +47,7 @@ def library_errors(what: str) -> Iterator[None]:
     except MisstepError:
         raise
     except Exception as error:  # assertions, struct.error, KeyError ...: it expects no damage
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = reason_of(error)
         raise MisstepError(f"{what} cannot be read ({reason[:_LONGEST_REASON]})") from error
 
 

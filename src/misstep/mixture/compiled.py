@@ -158,8 +158,9 @@ def scaled_variance(h, m, covariances, scale):
         for k in range(n_components):
             mean += h[k] * m[k, i]
         for k in range(n_components):
-            deviation = m[k, i] - mean
-            second += h[k] * (covariances[k, i, i] + deviation * deviation)
+            if h[k] > 0.0:  # 0 × ∞ is no number
+                deviation = m[k, i] - mean
+                second += h[k] * (covariances[k, i, i] + deviation * deviation)
         total += second / (scale[i] * scale[i])
     return total / d
 

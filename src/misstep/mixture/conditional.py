@@ -43,10 +43,17 @@ class Conditional(NamedTuple):
 
     @property
     def variance(self) -> Array:
-        """V = Σ h_k (S_k + m_k m_kᵀ) − E Eᵀ, shape (d, d), summed about E for accuracy."""
+        """V = Σ h_k (S_k + m_k m_kᵀ) − E Eᵀ, shape (d, d), summed about E for accuracy.
+
+        Where means lie so far apart that an entry leaves the range of numbers, it is infinite.
+        """
         deviations = self.means - self.mean
-        outer = deviations[:, :, None] * deviations[:, None, :]
-        return np.einsum("k,kij->ij", self.weights, self.covariances + outer)
+        deviations[self.weights == 0.0] = 0.0  # 0 × ∞ is no number
+        with np.errstate(over="ignore", invalid="ignore"):
+            outer = deviations[:, :, None] * deviations[:, None, :]
+            variance = np.einsum("k,kij->ij", self.weights, self.covariances + outer)
+        variance[np.isnan(variance)] = np.inf
+        return variance
 
 
 class Conditioner:

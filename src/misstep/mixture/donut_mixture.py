@@ -40,7 +40,8 @@ def exploration_from_variance(
     Raises
     ------
     MisstepError
-        If the shapes disagree, a value is not finite or not positive, or there is no such formula.
+        If the shapes disagree, a variance is no number or negative, the scale is not positive and
+        finite, or there is no such formula.
     """
     v, s = np.array(variance, dtype=np.float64), np.array(scale, dtype=np.float64)
     if formula not in FORMULAS:
@@ -50,9 +51,9 @@ def exploration_from_variance(
             f"exploration takes a variance (d, d) and a positive scale (d,), got {v.shape} and "
             f"{s.tolist()}"
         )
-    if not np.all(np.isfinite(v)) or np.any(np.diag(v) < 0):
+    if np.any(np.isnan(v)) or np.any(np.diag(v) < 0):
         raise MisstepError(
-            f"exploration takes a variance that is finite and not negative, got {v.tolist()}"
+            f"exploration takes a variance of numbers, none negative, got {v.tolist()}"
         )
     with np.errstate(over="ignore"):
         spread = float(np.mean(np.diag(v) / s**2))

@@ -26,7 +26,6 @@ In a file the same is said in TOML ::
 import json
 import math
 import re
-import sys
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -37,11 +36,11 @@ import numpy as np
 
 from misstep.errors import MisstepError
 from misstep.formats.format import Block, Episode, FloatArray, Header, ReadOptions
+from misstep.parameters import LARGEST
 from misstep.storage import write_text
 from misstep.trajectory import Column
 from misstep.units import UNITS
 
-_LARGEST = sys.float_info.max  # a whole number can be larger
 _ITEM = re.compile(
     r"""\s*(?P<name>[^=:,"]+?)\s*
         (?:=\s*(?:"(?P<quoted>[^"]*)"|(?P<source>[^=:,"]+?))\s*)?
@@ -85,7 +84,7 @@ class MappedColumn:
             value = getattr(self, field)
             if isinstance(value, bool) or not isinstance(value, int | float):
                 raise MisstepError(f"column {self.name!r}: {field} is {value!r}, not a number")
-            if not abs(value) <= _LARGEST or (field == "factor" and value == 0):
+            if not abs(value) <= LARGEST or (field == "factor" and value == 0):
                 raise MisstepError(
                     f"column {self.name!r}: {field} is {_told(value)}, but must be finite"
                     + (" and not zero" if field == "factor" else "")
@@ -123,7 +122,7 @@ class ColumnMapping:
         if self.named not in (None, True, False):
             raise MisstepError(f"named is {self.named!r}: it is true or false")
         if self.rate is not None and not (
-            isinstance(self.rate, int | float) and 0 < self.rate <= _LARGEST
+            isinstance(self.rate, int | float) and 0 < self.rate <= LARGEST
         ):
             raise MisstepError(f"the rate is {_told(self.rate)}: it has to be positive, in Hz")
         for field in ("time", "episode"):
@@ -181,7 +180,7 @@ class ColumnMapping:
 
 def _told(value: object) -> str:
     """Return a value as a message has it."""
-    if isinstance(value, int) and abs(value) > _LARGEST:
+    if isinstance(value, int) and abs(value) > LARGEST:
         return "too large"
     return f"{value:g}" if isinstance(value, int | float) else repr(value)
 

@@ -215,18 +215,13 @@ def losing(episodes: Iterator[Episode], target: Format, *, allowed: bool) -> Ite
         On the way, with a list of what would be lost.
     """
     for index, episode in enumerate(episodes):
-        lost = losses(target, episode.header)
+        lost = target.losses(episode.header)
         if lost and not allowed:
             raise MisstepError(
                 f"{target.description.partition(';')[0]} cannot hold of episode_{index}: "
                 f"{'; '.join(lost)}; add --allow-loss to write it without"
             )
         yield episode
-
-
-def losses(target: Format, header: Header) -> list[str]:
-    """Return what a file of a format cannot hold of an episode, a line each."""
-    return list(target.losses(header))
 
 
 def _counted(episode: Episode) -> Episode:
@@ -291,7 +286,7 @@ class Summary:
         self.first = self.first or header
         self.episodes += 1
         self.rates.append(None if header.dt is None else 1.0 / header.dt)
-        for line in losses(target, header):
+        for line in target.losses(header):
             self.losses[line] = self.losses.get(line, 0) + 1
 
         def blocks() -> Iterator[Block]:

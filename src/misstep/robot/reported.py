@@ -38,13 +38,7 @@ class Reported(System):
     """
 
     def __init__(self, system: System, n_steps: int, lasting: bool) -> None:
-        self.system_id = system.system_id  # type: ignore[misc]
-        self.parameters_type = system.parameters_type  # type: ignore[misc]
-        self.parameters = system.parameters
-        self.dt = system.dt
-        self.observation_columns = system.observation_columns
-        self.action_columns = system.action_columns
-        self.observation_space, self.action_space = system.observation_space, system.action_space
+        self._take_after(system)
         self.state: State | None = None
         self._n_steps, self._lasting, self._t = n_steps, lasting, 0
 

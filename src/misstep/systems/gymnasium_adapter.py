@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from misstep.costs import StateCost
-from misstep.errors import MisstepError
+from misstep.errors import MisstepError, reason_of
 from misstep.judges import Judge
 from misstep.parameters import ParameterValue, build_parameters, check_parameters, parameter
 from misstep.systems.judged import Judged
@@ -303,7 +303,7 @@ def _make(env_id: str, render_mode: str | None, parameters: Mapping[str, Any]) -
             **parameters,
         )
     except (gymnasium.error.Error, ImportError, OSError, TypeError, ValueError) as error:
-        reason = " ".join(str(error).split())
+        reason = reason_of(error)
         raise MisstepError(f"gym:{env_id} cannot be made: {reason}") from error
 
 

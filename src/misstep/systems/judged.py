@@ -84,11 +84,7 @@ class Judged(System):
         self._cost = _read(parse_cost, cost, columns, f"{name}, cost")
         self._needed = _steps_to_hold(name, hold, self._success, system.dt)
 
-        self.system_id = name  # type: ignore[misc]
-        self.parameters_type = system.parameters_type  # type: ignore[misc]
-        self.dt = system.dt
-        self.observation_columns, self.action_columns = columns, system.action_columns
-        self.observation_space, self.action_space = system.observation_space, system.action_space
+        self._take_after(system)
         self.metadata, self.render_mode = system.metadata, system.render_mode
         self.cost = system.cost if self._cost is None else None
         own: dict[str, ParameterValue] = {

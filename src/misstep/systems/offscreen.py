@@ -17,6 +17,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from misstep.errors import reason_of
+
 _SAMPLES = 4  # per pixel, for smooth edges
 _MAX_GEOMS = 500
 # Why OpenGL failed, once it has: a second attempt can abort the process inside of MuJoCo.
@@ -134,7 +136,7 @@ def _open(model: Any, width: int, height: int) -> tuple[Any, Any]:
             renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
     # A missing library, driver or display surfaces as almost any kind of exception.
     except Exception as error:
-        _failures.append(" ".join(str(error).split()) or type(error).__name__)
+        _failures.append(reason_of(error))
         raise NoOpenGLError(_failures[0]) from error
     mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, renderer)
     return context, renderer

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from misstep.costs import StateCost
-from misstep.errors import MisstepError
+from misstep.errors import MisstepError, reason_of
 from misstep.parameters import ParameterValue
 from misstep.systems.mechanics import Mechanics
 from misstep.trajectory import Column
@@ -78,6 +78,16 @@ class System(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
             "motion, nor its equations checked; the cart-poles have"
         )
 
+    def _take_after(self, system: "System") -> None:
+        """Be described as `system` is, whose episodes come from elsewhere or are judged anew."""
+        self.system_id = system.system_id  # type: ignore[misc]
+        self.parameters_type = system.parameters_type  # type: ignore[misc]
+        self.parameters = system.parameters
+        self.dt = system.dt
+        self.observation_columns = system.observation_columns
+        self.action_columns = system.action_columns
+        self.observation_space, self.action_space = system.observation_space, system.action_space
+
     def no_episode(self) -> MisstepError:
         """Return what `step` raises before the first `reset` and after the end of an episode."""
         return MisstepError(f"{self.system_id}: no episode is running; call reset() before step()")
@@ -121,7 +131,7 @@ def compiled(spec: Any, owner: str) -> Any:
     try:
         return spec.compile()
     except ValueError as error:
-        reason = " ".join(str(error).split())
+        reason = reason_of(error)
         raise MisstepError(
             f"{owner}: MuJoCo cannot build it with these parameters: {reason}"
         ) from error

@@ -11,7 +11,7 @@ from typing import Any
 
 import h5py
 
-from misstep.errors import MisstepError
+from misstep.errors import MisstepError, reason_of
 
 _LONGEST_TEXT = 64000  # bytes: HDF5 has room for 64 KiB, what describes it included
 
@@ -36,7 +36,7 @@ def damage(what: str) -> Iterator[None]:
     except MisstepError:
         raise
     except _DAMAGE as error:
-        reason = " ".join(str(error).split())
+        reason = reason_of(error)
         raise MisstepError(f"{what} is damaged ({reason})") from error
 
 

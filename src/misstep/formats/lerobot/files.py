@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from misstep.errors import MisstepError
+from misstep.errors import MisstepError, reason_of
 from misstep.formats.libraries import read_json
 
 REWARD, DONE, SUCCESS = "next.reward", "next.done", "next.success"
@@ -39,7 +39,7 @@ def damage(what: str) -> Iterator[None]:
         TypeError,
         ValueError,
     ) as error:
-        reason = " ".join(str(error).split())
+        reason = reason_of(error)
         raise MisstepError(f"{what} is damaged ({reason[:300]})") from error
 
 

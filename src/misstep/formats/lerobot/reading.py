@@ -3,7 +3,6 @@
 import json
 import math
 import re
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -29,6 +28,7 @@ from misstep.formats.guard import prefixed
 from misstep.formats.lerobot.files import REWARD, SUCCESS, damage, read_lines
 from misstep.formats.lerobot.footer import column_parts
 from misstep.formats.libraries import needed, read_json
+from misstep.parameters import LARGEST
 from misstep.trajectory import Column, Outcome, Provenance
 
 if TYPE_CHECKING:
@@ -103,11 +103,7 @@ def _info(said: dict[str, Any]) -> _Info:
     if not re.match(r"v?[23]\.", version):
         raise MisstepError(f"info.json says codebase_version {version}: 2.x and 3.x are read")
     rate, features = said.get("fps"), said.get("features")
-    if (
-        not isinstance(rate, int | float)
-        or isinstance(rate, bool)
-        or not 0 < rate <= sys.float_info.max
-    ):
+    if not isinstance(rate, int | float) or isinstance(rate, bool) or not 0 < rate <= LARGEST:
         raise MisstepError(f"info.json says fps {rate!r}: it has to be a positive number")
     if not isinstance(features, dict):
         raise MisstepError("info.json names no features")

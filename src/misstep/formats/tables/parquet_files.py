@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from misstep.errors import MisstepError
+from misstep.errors import MisstepError, reason_of
 from misstep.formats.format import BLOCK_ROWS, Episode, FloatArray, Format, ReadOptions
 from misstep.formats.guard import prefixed
 from misstep.formats.libraries import needed, parquet_writer
@@ -47,7 +47,7 @@ def read(path: Path, options: ReadOptions) -> Iterator[Episode]:
             reader = _RowReader(arrow, file, options)
             yield from read_table(Table(reader.cells, True, "row", reader.rows), options)
     except (arrow.ArrowException, OSError, UnicodeDecodeError, MemoryError) as error:
-        raise MisstepError(f"it is damaged ({' '.join(str(error).split())})") from error
+        raise MisstepError(f"it is damaged ({reason_of(error)})") from error
 
 
 def _opened(arrow: Any, path: Path) -> Any:

@@ -75,14 +75,7 @@ class JointSystem(System):
     def __init__(
         self, described: System, robot: Robot, *, safe: Row | None = None, patience: float = 1.0
     ) -> None:
-        self.system_id = described.system_id  # type: ignore[misc]
-        self.parameters_type = described.parameters_type  # type: ignore[misc]
-        self.parameters = described.parameters
-        self.dt = described.dt
-        self.observation_columns = described.observation_columns
-        self.action_columns = described.action_columns
-        self.observation_space = described.observation_space
-        self.action_space = described.action_space
+        self._take_after(described)
         self.render_mode = None
         self.safe = Limits.of(described).safe if safe is None else safe
         self.stamp = 0.0
