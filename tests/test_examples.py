@@ -1,40 +1,61 @@
-"""The examples run as scripts, and the README shows the same code as the first."""
+"""The examples run and show what they are kept with; the README has the same code as the first."""
 
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import nbformat
 import pytest
 
 ROOT = Path(__file__).parents[1]
 QUICKSTART = ROOT / "examples" / "quickstart.py"
-
-# What each prints when it has done what it says.
-PRINTED = {
-    "quickstart": r"1 trials, success: True\nthe last policy balances from \d+% of starts, .*\n",
-    "idea": r"\d components, chosen by minimum BIC\n(.* N\n){3}picture in idea.png\n",
-    "own_system": r"\[.*\]\n(failure after .*\n){4}\d+ trials, success: True\n\d+ of 10 .*\n",
-}
+NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
 
 
-def test_there_is_an_expectation_of_each_example():
-    assert {path.stem for path in (ROOT / "examples").glob("*.py")} == set(PRINTED)
-
-
-@pytest.mark.parametrize("name", PRINTED)
-def test_example_runs(name, tmp_path, monkeypatch):
-    monkeypatch.setenv("MPLBACKEND", "Agg")
+def test_the_quickstart_runs(tmp_path):
     done = subprocess.run(
-        [sys.executable, "-W", "error", str(ROOT / "examples" / f"{name}.py")],
+        [sys.executable, "-W", "error", str(QUICKSTART)],
         cwd=tmp_path,
         capture_output=True,
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    assert re.fullmatch(PRINTED[name], done.stdout), done.stdout
-    for picture in re.findall(r"picture in (\S+)", done.stdout):
-        assert (tmp_path / picture).stat().st_size > 10_000
+    expected = r"1 trials, success: True\nthe last policy balances from \d+% of starts, .*\n"
+    assert re.fullmatch(expected, done.stdout), done.stdout
+
+
+def shown(notebook):
+    """Return what each cell of code prints, and how many pictures it draws."""
+    cells = [cell.outputs for cell in notebook.cells if cell.cell_type == "code"]
+    return [
+        (
+            "".join(output.text for output in outputs if output.output_type == "stream"),
+            sum(len(output.get("data", {}).get("image/png", "")) > 10_000 for output in outputs),
+        )
+        for outputs in cells
+    ]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_shows_what_it_is_kept_with(path, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "scripts/notebooks.py", str(path), "--out", str(tmp_path)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    kept, fresh = (nbformat.read(folder / path.name, 4) for folder in (path.parent, tmp_path))
+    nbformat.validate(kept)
+    assert shown(kept) == shown(fresh)
+    text, pictures = zip(*shown(kept), strict=True)
+    assert any(text)
+    assert sum(pictures) == sum("plt.show()" in cell.source for cell in kept.cells)
+
+
+def test_there_are_notebooks():
+    assert len(NOTEBOOKS) >= 3
 
 
 def test_readme_shows_the_quickstart():
