@@ -8,8 +8,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from misstep.runs import read_json
-from misstep.storage import write_json
+from misstep.storage import read_json, write_json
 
 DOCS = Path(__file__).parents[1] / "docs"
 FIGURES = ("distribution", "variants", "figure_02")

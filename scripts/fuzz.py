@@ -18,6 +18,8 @@ from fuzzing.cases import Target, case_of, kept, tried
 from fuzzing.targets import TARGETS
 from fuzzing.workers import opened, scratch
 
+from misstep.errors import MisstepError
+
 
 def main() -> int:
     """Run what the command line says; return the exit code."""
@@ -40,7 +42,10 @@ def main() -> int:
         return 0
     if options.case is not None:
         return _try_again(targets[0], options.seed, options.case, options.keep)
-    campaign = Campaign(targets, options.seed, options.cases, options.state)
+    try:
+        campaign = Campaign(targets, options.seed, options.cases, options.state)
+    except MisstepError as error:
+        parser.error(str(error))
     campaign.run(
         options.workers, options.budget, options.slice, lambda line: print(line, flush=True)
     )

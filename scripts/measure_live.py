@@ -43,6 +43,8 @@ def main() -> None:
         server = subprocess.Popen(arguments)  # noqa: S603 - our own command
         try:
             while not told.exists():
+                if server.poll() is not None:
+                    sys.exit(f"the page has ended with {server.returncode}")
                 time.sleep(0.1)
             _measure(json.loads(told.read_text())["url"], Path(folder), asked)
         finally:

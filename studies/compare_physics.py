@@ -20,7 +20,7 @@ from scipy.stats import wilcoxon
 from misstep.paper.costs import HORIZONS
 from misstep.paper.experiments import VARIANTS
 from misstep.paper.measures import CellMeasures
-from misstep.runs import read_json
+from misstep.storage import read_json
 
 
 def read_costs(out, variant):

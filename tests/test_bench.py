@@ -162,9 +162,17 @@ def test_a_process_that_dies_is_told_and_replaced(worker):
     job = {"warm": 500, "most": 2, "seed": 0, "repeats": 1}
     with worker(SCIKIT_LEARN) as process:
         first = process.ask("scan", {"X": X}, 60, **job)
-        os.kill(process.process_id, signal.SIGKILL)
+        os.kill(process._running().pid, signal.SIGKILL)
         assert process.ask("scan", {"X": X}, 60, **job) == {"error": "its process died"}
         assert process.ask("scan", {"X": X}, 60, **job)["k"] == first["k"]
+
+
+def test_half_an_answer_is_that_of_a_process_that_died(tmp_path):
+    dying = tmp_path / "python"
+    dying.write_text("#!/bin/sh\nread job\nprintf '{\"k\": 1'\n")
+    dying.chmod(0o755)
+    with Worker(SCIKIT_LEARN, dying, 1, tmp_path) as process:
+        assert process.ask("scan", {}, 60) == {"error": "its process died"}
 
 
 # Their environment
@@ -223,6 +231,8 @@ def test_ratios_are_between_rows_of_the_same_work_alone():
     assert (query.ratio_to_pypr, query.ratio_to_gmr) == (200.0, None)
     assert (pypr.ratio_to_pypr, gmr.ratio_to_pypr) == (1.0, None)
     assert (ours.ratio_to_sklearn, theirs.ratio_to_sklearn) == (3.0, 1.0)
+    [alone] = results.compare(rows[1:2])
+    assert alone.log_likelihood_difference is None
 
 
 def test_a_slope_is_the_power_of_the_growth():

@@ -214,6 +214,18 @@ def test_growth_rises_to_one():
         assert danger[-1] == 1
 
 
+@pytest.mark.parametrize("path", [[0, 0, 0, 0], [0, 1, 2, 0]])
+def test_what_ends_where_it_began_has_not_grown(path):
+    states, actions = np.array(path, float)[:, None], np.array([[1.0], [-1.0], [0.5]])
+    columns = (Column("x", "m"),), (Column("u", "N"),)
+    source = Provenance("", {}, "", None, "")
+    stuck = Trajectory(states, actions, 0.1, *columns, source, Outcome.FAILURE, None, 3)
+    assert growth_dangers([stuck, stuck]) == [None, None]
+    (blame,) = find_blame(Dataset([stuck]))
+    assert blame.danger is None
+    assert "cannot be told" in blame.sentence
+
+
 def test_who_acts_alone_departs_and_who_acts_alike_does_not():
     rng = np.random.default_rng(0)
 

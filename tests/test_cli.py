@@ -17,6 +17,7 @@ from scipy import stats
 import misstep
 from misstep.cli import main
 from misstep.cli.options import parse_parameters
+from misstep.cli.ros import _joint_names
 
 # Interrupts are set up as on a terminal, however the tests themselves were started.
 PROGRAM = (
@@ -325,6 +326,15 @@ NOWHERE = ("--out", "D.h5/sub/x.h5")  # below a file: even the administrator can
         (("reproduce", "--out", "P", "--seeds", "0"), ["seeds", "at least 1"]),
         (("reproduce", "--out", "P", "--workers", "0"), ["workers is 0"]),
         (("reproduce", "--out", "P", "--json", "gone/r"), ["--json", "folder gone"]),
+        (
+            ("ros2", "control", "--by", "magic", "--out", "N.h5", "--patience", "0"),
+            ["no demonstrator named 'magic'"],
+        ),
+        (
+            ("ros2", "control", "--by", "weak", "--out", "N.h5", "--with", "a=1"),
+            ["demonstrator weak has no parameter 'a'"],
+        ),
+        (("ros2", "explore", "RUN", "--with", "reach"), ["--with 'reach'", "name=value"]),
         (("evaluate", "."), ["run.json"]),
         (("evaluate", "RUN", "--episodes", "many"), ["--episodes"]),
     ],
@@ -334,6 +344,35 @@ def test_bad_words(here, capsys, words, told):
     line = refused(capsys, *words)
     for fragment in told:
         assert fragment in line
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("inspect", "D.h5", "--out", "./D.h5"),
+        ("inspect", "D.h5", "--json", "D.h5"),
+        ("mark", "D.h5", "--json", "D.h5"),
+        ("convert", "D.h5", "N.csv", "--json", "D.h5"),
+        ("convert", "D.h5", "N.csv", "--save-mapping", "D.h5"),
+        (*LEARN, "--from", "D.h5", "--json", "D.h5"),
+    ],
+    ids=" ".join,
+)
+def test_no_result_takes_the_place_of_what_is_read(here, capsys, words):
+    before = Path("D.h5").read_bytes()
+    assert "D.h5 is what is read, and would be lost" in refused(capsys, *words)
+    assert Path("D.h5").read_bytes() == before
+
+
+def test_a_package_that_cannot_be_loaded_is_told_in_one_line(here, tmp_path, monkeypatch, capsys):
+    told = tmp_path / "broken-1.0.dist-info"
+    told.mkdir()
+    (told / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
+    (told / "entry_points.txt").write_text("[misstep.learners]\nbroken = no_such_place:Learner\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    line = refused(capsys, "list", "learners")
+    assert "the learner 'broken' is no_such_place:Learner of an installed package" in line
+    assert "No module named 'no_such_place'" in line
 
 
 def empty(path):
@@ -450,6 +489,10 @@ def test_parse_parameters():
     assert parse_parameters("--set", None) == {}
 
 
+def test_names_of_joints_stay_as_they_are_written():
+    assert _joint_names(["x=007", "theta = true"]) == {"x": "007", "theta": "true"}
+
+
 # Killed, interrupted, unheard
 
 
@@ -502,6 +545,17 @@ def test_nobody_reads_the_output():
     done = subprocess.run(words, stdout=writing, stderr=subprocess.PIPE, text=True)
     os.close(writing)
     assert (done.returncode, done.stderr) == (1, "")
+
+
+@pytest.mark.parametrize("words", [("list", "systems"), ("--version",), ("study", "--help")])
+def test_no_room_for_the_output(words):
+    with open("/dev/full", "w") as full:
+        words = [sys.executable, "-c", PROGRAM, *words]
+        done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 2
+    assert done.stderr == (
+        "misstep: error: cannot write: No space left on device; free some room\n"
+    )
 
 
 def test_bad_input_from_a_shell(here):

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 
-from misstep.mixture import Conditioner, GaussianMixture, compiled, reference
+from misstep.mixture import Conditional, Conditioner, GaussianMixture, compiled, reference
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -176,3 +176,9 @@ def test_many_states_are_checked(refused):
     for states in ([0.0], [[0.0, 0.0]], [[np.nan]]):
         with refused(r"points are finite and have shape \(N, 1\)"):
             Conditioner(mixture, [0]).at_each(states)
+
+
+def test_a_variance_beyond_the_range_of_numbers_is_infinite():
+    means = np.array([[1.7e308], [-1.7e308]])
+    far = Conditional(np.array([0.9, 0.1]), means, np.ones((2, 1, 1)))
+    assert far.variance.tolist() == [[np.inf]]

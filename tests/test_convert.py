@@ -109,6 +109,7 @@ def test_a_mapping_comes_back_from_its_file(tmp_path_factory, mapping):
         ("rate = ", "no TOML"),
         ("rate = -1", "the rate is -1"),
         ("rate = 'fast'", "the rate is 'fast'"),
+        ("rate = true", "the rate is True"),
         ("speed = 1", "a mapping has no 'speed'; it has: observations, actions, time"),
         ("time = 3", "time is 3: name a column"),
         ("observations = 3", "listed as"),
@@ -279,7 +280,7 @@ def test_times_that_are_uneven_are_brought_to_one_clock(convert):
         (("log.csv", "a.h5", "--rate", "100"), "no actions, which this format has to have"),
         (("log.csv", "a.h5", "--rate", "0"), "the rate is 0"),
         (("D.h5", "a.h5", "--to-rate", "-5"), "--to-rate is -5"),
-        (("D.h5", "a.h5", "--to-rate", "0.001"), "shorter than one step"),
+        (("D.h5", "a.h5", "--to-rate", "0.001"), "a.h5: D.h5: an episode is shorter than one step"),
         (("D.h5", "a.h5", "--columns", "y"), "no column 'y' for 'y'; there are: x"),
         (("D.h5", "a.h5", "--failure", "y > 1"), "--failure, character 1: no column 'y'"),
         (("D.h5", "a.h5", "--set", "length=2"), "name it with --system"),
@@ -288,6 +289,10 @@ def test_times_that_are_uneven_are_brought_to_one_clock(convert):
         (("D.h5", "a.h5", "--infer-actions", "guess"), "there are inverse-dynamics and velocities"),
         (("D.h5", "a.h5", "--infer-actions", "inverse-dynamics"), "name it with --system"),
         (("D.h5", "a.h5", "--infer-actions", "velocities:y"), "no observation column 'y'"),
+        (
+            ("D.h5", "a.h5", "--infer-actions", "inverse-dynamics:x", "--system", "cartpole"),
+            "only velocities are of some columns",
+        ),
         (("D.h5", "a.h5", "--angles", "flat"), "recorded, wrapped and unwrapped"),
         (("D.h5", "a.h5", "--format", "excel"), "no format named 'excel'"),
         (("D.h5", "a.h5", "--mapping", "none.toml"), "cannot read none.toml"),
@@ -352,6 +357,38 @@ def test_a_value_that_overflows_is_refused(convert, here):
     assert code == 2
     assert "too large to be finite" in err
     assert os.listdir(here) == ["log.csv"]
+
+
+def test_a_short_recording_at_another_rate_is_the_same_in_every_format(convert):
+    short = dataset(n=1)[0].cut(9)
+    misstep.save_dataset(Dataset([short]), "D.h5")
+    for name in ("E.h5", "E.csv", "E.parquet"):
+        assert convert("D.h5", name, "--to-rate", 10)[0] == 0
+        (found,) = load_dataset(name)
+        assert found.n_steps == 1
+        assert found.actions[0] == pytest.approx(short.actions[:5].mean(axis=0))
+
+
+def test_what_is_found_wrong_on_the_way_is_told_with_its_file(convert, here):
+    times = np.arange(40_000) * 0.01
+    for name, gap in (("one.csv", 0.0), ("two.csv", 3.0)):
+        rows = np.stack([times + gap * (times > 300), times, times], 1)
+        np.savetxt(here / name, rows, "%.4f", ",", header="t,x,action:u", comments="")
+    code, _, err = convert("one.csv", "two.csv", "out.h5", "--to-rate", 50)
+    assert code == 2
+    assert "two.csv: line 30003: 3.01 s have passed since the row before" in err
+    (here / "two.csv").write_text("t,x,action:u\n0,0,0\n1,1,oops\n")
+    code, _, err = convert("one.csv", "two.csv", "out.h5", "--to-rate", 50)
+    assert code == 2
+    assert err.count("two.csv") == 1
+
+
+def test_a_recording_too_short_for_the_equations_says_so(convert):
+    short = dataset(n=1)[0].cut(5)
+    misstep.save_dataset(Dataset([short]), "D.h5")
+    code, out, _ = convert("D.h5", "E.h5", "--system", "cartpole")
+    assert code == 0
+    assert "the equations were not checked: every episode is shorter than 8 rows" in out
 
 
 def test_an_outcome_that_was_recorded_moves_with_the_rate(convert):

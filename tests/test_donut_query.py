@@ -102,3 +102,12 @@ def test_states_are_checked(refused, random_mixture):
     for states in ([0.0], [[0.0, 1.0]], [[math.nan]]):
         with refused(r"points are finite and have shape \(N, 1\)"):
             query.modes(states)
+
+
+@pytest.mark.parametrize(("formula", "expected"), [("prose", 1.0), ("printed", 0.0)])
+@pytest.mark.parametrize("state", [1e300, -1.7e308])
+def test_exploration_is_a_number_where_the_actions_are_none(formula, expected, state):
+    covariances = [[[1.0, 0.9], [0.9, 1.0]], [[1.0, -50.0], [-50.0, 3000.0]]]
+    mixture = GaussianMixture.from_parameters([0.5, 0.5], [[0.0, 0.0], [1.0, 5.0]], covariances)
+    query = DonutQuery(Conditioner(mixture, [0]), [1.0], formula=formula)
+    assert query.explore(np.array([state]), np.zeros(1), warm=False) == expected

@@ -569,6 +569,7 @@ def test_a_cost_of_other_columns_is_refused(refused, cartpole, shown):
         ("circles", lambda a: np.array([[0], [4]]), "two rows of distinct columns, from 0 to 3"),
         ("circles", lambda a: np.array([[1], [1]]), "two rows of distinct columns, from 0 to 3"),
         ("settings", lambda a: a * [0, 1], "horizon is 0 steps"),
+        ("settings", lambda a: a * np.inf, r"horizon and seed are \[inf, inf\]"),
     ],
 )
 def test_damaged_policies_are_refused(refused, policy, cartpole, name, change, message):

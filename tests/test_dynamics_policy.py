@@ -132,6 +132,7 @@ def test_a_policy_of_cosine_and_sine_acts_on_the_angle():
         ("outer", lambda a: a[:, 1:], "outer has shape"),
         ("outer", lambda a: a * np.nan, "finite numbers"),
         ("mean", lambda a: a[1:], "mean has shape"),
+        ("scale", lambda a: a * 0, "not all positive"),
         ("angles", lambda a: a[1:], "angles has shape"),
         ("circles", lambda a: np.array([[0.0], [7.0]]), "distinct columns"),
     ],

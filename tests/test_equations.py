@@ -176,7 +176,17 @@ def test_what_does_not_move_cannot_be_checked():
     (check,) = check_equations([recording(still, COLUMNS)], heavy())
     assert check.r_squared is None
     assert not check.holds
-    assert check.sentences == ("theta does not accelerate: its equation cannot be checked",)
+    sentence = "theta does not accelerate where nothing is hit: its equation cannot be checked"
+    assert check.sentences == (sentence,)
+
+
+def test_what_lies_beyond_the_stops_cannot_be_checked(attempts):
+    far = [observations + np.array([500.0, 0.0, 0.0, 0.0]) for observations in attempts]
+    for check in check_equations(shown(far), heavy(rail=2.0)):
+        assert check.r_squared is None
+        assert not check.holds
+        assert not check.fits
+        assert "where nothing is hit" in check.sentences[0]
 
 
 def test_only_systems_that_can_be_run_backwards(attempts):

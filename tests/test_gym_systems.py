@@ -236,6 +236,7 @@ def test_by_itself_it_judges_nothing():
         ("gym:CartPole-v1", {}, r"gym:CartPole-v1 has actions in Discrete\(2\), but a Box"),
         ("gym:FrozenLake-v1", {}, r"gym:FrozenLake-v1 has observations in Discrete\(16\), but"),
         ("gym:Pendulum-v1", {"mass": 2.0}, "gym:Pendulum-v1 cannot be made: .*'mass'"),
+        ("gym:InvertedPendulum-v5", {"frame_skip": 0}, "cannot be made: .*division by zero"),
         ("gym:Pendulum-v1", {"duration": -1}, "gym: duration is -1 s but must be at least 0 s"),
         ("gym:Pendulum-v1", {"duration": 0.01}, "shorter than one control period of 0.05 s"),
         ("gym:Pendulum-v1", {"success": "theta > 1"}, "no column 'theta'; there are: cos_theta"),
@@ -265,3 +266,20 @@ def test_random_needs_limits(refused):
 
     with refused("random does not fit gym:Pendulum-v1: its actions must have limits"):
         demonstrate(Boundless(), "random")
+
+
+@pytest.mark.parametrize("parameters", [{}, {"success": "o9 > 1"}, {"duration": 1e-3}])
+def test_what_is_refused_after_it_was_made_is_closed(refused, parameters):
+    closed = []
+
+    class Unknown(gymnasium.envs.classic_control.PendulumEnv):
+        def close(self):
+            closed.append(self)
+
+    gymnasium.register("Unknown-v0", Unknown)
+    try:
+        with refused("does not say what it is|no column 'o9'|shorter than one control period"):
+            make_system("gym:Unknown-v0", **parameters)
+    finally:
+        del gymnasium.registry["Unknown-v0"]
+    assert len(closed) == 1

@@ -21,6 +21,7 @@ import misstep
 from misstep import MisstepError, Outcome, load_run, make_system
 from misstep.errors import _LONGEST
 from misstep.formats import FORMATS, ReadOptions, load_dataset, read_episodes, save_dataset
+from misstep.learners import LEARNERS
 from misstep.live.downloads import upload_suffix
 from misstep.live.protocol import parse
 from misstep.study.spec import load_study
@@ -104,6 +105,17 @@ def test_hostile_input_is_taken_or_refused_in_one_line(tmp_path, what):
         # Some of it goes deep, and some of it does harm.
         assert min(count["taken"], count["refused"]) > 0, name
         assert count["taken"] + count["refused"] == cases, name
+
+
+def test_counts_of_another_seed_are_not_gone_on_with(tmp_path):
+    state = tmp_path / "counts.json"
+    state.write_text('{"seed": 1, "targets": {}}')
+    words = ["--target", "formula", "--cases", "1", "--state", str(state)]
+    done = subprocess.run(
+        [sys.executable, str(SCRIPTS / "fuzz.py"), *words], capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert "counts cases of seed 1, not of 0" in done.stderr
 
 
 BROKEN = """
@@ -205,6 +217,38 @@ def test_numbers_that_physics_cannot_take_are_refused(refused):
         make_system("flipup", block_mass=1e-300)
     with refused("a number is wanted|is not from"):
         parse('{"t": "poke", "side": 1' + "0" * 400 + "}")
+
+
+@pytest.mark.parametrize("system", ["cartpole", "flipup"])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("physics_step", 1e-300), ("control_rate", 1e-300), ("control_rate", 1e300)],
+)
+def test_time_that_nobody_can_simulate_is_refused(refused, system, name, value):
+    with refused(f"{name} is .* but must be at (least|most)"):
+        make_system(system, **{name: value})
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda: make_system("cartpole", duration=1e308),
+        lambda: make_system("cartpole", delay=1e12),
+        lambda: make_system("basket", longest_wait=1e308),
+        lambda: make_system("cartpole", success="x > 1", hold=1e308),
+        lambda: make_system("gym:Pendulum-v1", dt=5e-324),
+        lambda: misstep.demonstrate(make_system("cartpole"), by="weak", delay=1e12),
+        lambda: misstep.demonstrate(make_system("cartpole"), by="bang-bang", reaction_max=1e12),
+        lambda: LEARNERS["donut-incremental"](outlook=1e12),
+        lambda: LEARNERS["fall"](horizon=1e308),
+        lambda: LEARNERS["dynamics"](trial_seconds=1e308),
+        lambda: LEARNERS["mean"](resolution=1e300),
+        lambda: LEARNERS["dynamics-policy"](rollouts=1e12),
+    ],
+)
+def test_times_and_counts_that_no_memory_holds_are_refused(refused, build):
+    with refused("must be .*at (least|most)"):
+        build()
 
 
 def test_an_error_is_one_printable_line_whatever_it_quotes():

@@ -8,7 +8,7 @@ import pytest
 from misstep import Column, Dataset, Outcome, Provenance, Trajectory, demonstrate, save_dataset
 from misstep.blame import find_blame
 from misstep.cli import main
-from misstep.inspection import inspect_file
+from misstep.inspection import inspect, inspect_file
 from misstep.inspection.filmstrip import PICTURES, draw_filmstrip, shown_steps
 from misstep.inspection.page import render_inspection
 
@@ -74,8 +74,8 @@ def test_json_has_the_names_that_are_fixed(file, tmp_path, capsys):
         assert episode["sentence"].startswith("recoverable until")
 
 
-def attempt(x, u, **fields):
-    columns = (Column("x", "m"),), (Column("u", "N"),)
+def attempt(x, u, name="x", unit="m", **fields):
+    columns = (Column(name, unit),), (Column("u", "N"),)
     nowhere = Provenance("", {}, "", None, "")
     x, u = np.array(x, dtype=float)[:, None], np.array(u, dtype=float)[:, None]
     return Trajectory(x, u, 0.1, *columns, fields.pop("provenance", nowhere), **fields)
@@ -101,6 +101,35 @@ def test_odd_things_are_found(tmp_path):
     assert twin.duplicate_of == 1
     assert twin.oddities == ["the same as episode 1"]
     assert found.columns[1].at_limit == pytest.approx(np.mean(np.abs(u) == 1))
+
+
+@pytest.mark.parametrize(("unit", "turn"), [("rad", 2 * np.pi), ("deg", 360.0)])
+def test_an_angle_that_goes_on_at_the_other_end_of_its_turn_does_not_jump(tmp_path, unit, turn):
+    rng = np.random.default_rng(0)
+    angle = np.cumsum(rng.uniform(0.005, 0.015, 400)) * turn
+    wrapped = (angle + 0.5 * turn) % turn - 0.5 * turn
+    u = rng.standard_normal(399)
+    path = tmp_path / "turning.h5"
+    save_dataset(Dataset([attempt(wrapped, u, "theta", unit)]), path)
+    assert inspect_file(path).episodes[0].oddities == []
+
+
+def test_infinite_values_count_as_missing(tmp_path):
+    path = tmp_path / "inf.csv"
+    rows = [f"{i / 10},{ {10: 'inf', 11: '-inf'}.get(i, i * i) },1" for i in range(20)]
+    path.write_text("t,x,action:u\n" + "\n".join(rows) + "\n")
+    found = inspect_file(path)
+    assert found.episodes[0].missing == found.columns[0].missing == 2
+    assert found.episodes[0].oddities == ["2 missing values"]
+    assert found.columns[0].maximum == 19 * 19
+
+
+def test_more_than_memory_should_hold_is_summarised_all_the_same(file, shown, monkeypatch):
+    monkeypatch.setattr(inspect, "LARGEST_IN_MEMORY", 2 * shown[0].observations.nbytes)
+    found = inspect_file(file)
+    assert len(found.episodes) == len(shown)
+    assert "bytes in memory" in found.reason
+    assert found.dataset is None
 
 
 def test_an_actuator_that_is_not_used_up_is_not_saturated(file, shown, inspection):

@@ -9,8 +9,6 @@ from misstep.errors import MisstepError
 from misstep.formats.format import Block, Episode, Header
 from misstep.learning import learn
 from misstep.recordings.inverse_dynamics import (
-    infer_actions,
-    infer_velocities,
     inferring_actions,
     inferring_velocities,
     inverse_dynamics,
@@ -26,6 +24,14 @@ POSITIONS = (COLUMNS[0], COLUMNS[2])
 @pytest.fixture(scope="module")
 def pushed():
     return attempt(3)
+
+
+def with_actions(trajectory, system):
+    return inferring_actions(Episode.of(trajectory), system).trajectory()
+
+
+def with_velocities(trajectory, names=None):
+    return inferring_velocities(Episode.of(trajectory), names).trajectory()
 
 
 def at_50_hz(forces):
@@ -228,7 +234,7 @@ def test_the_provenance_says_what_was_inferred(pushed):
     bad = pushed[0].copy()
     bad[2000, 3] += 4.0
     shown = recording(bad, COLUMNS)
-    inferred = infer_actions(shown, heavy(force_limit=30.0))
+    inferred = with_actions(shown, heavy(force_limit=30.0))
     assert inferred.provenance.system == "cartpole-swingup"
     assert inferred.provenance.parameters["cart_mass"] == 10.0
     assert inferred.provenance.demonstrator == "person"
@@ -270,7 +276,7 @@ def test_a_long_recording_in_blocks_gives_the_same_as_all_at_once():
 
 def test_velocities_lead_from_one_observation_to_the_next(pushed):
     shown = recording(pushed[0], COLUMNS)
-    inferred = infer_velocities(shown, ["x", "theta"])
+    inferred = with_velocities(shown, ["x", "theta"])
     assert inferred.action_columns == (Column("x_dot", "m/s"), Column("theta_dot", "rad/s"))
     reached = shown.select(["x", "theta"])[:-1] + DT * inferred.actions
     reached[:, 1] = [wrap_angle(angle) for angle in reached[:, 1]]
@@ -303,14 +309,14 @@ def test_bad_input_is_named(pushed, change, message):
     with pytest.raises(MisstepError, match=message):
         inverse_dynamics(observations, columns, change.get("dt", DT), system)
     with pytest.raises(MisstepError, match="there is no observation column 'y'"):
-        infer_velocities(recording(pushed[0], COLUMNS), ["y"])
+        with_velocities(recording(pushed[0], COLUMNS), ["y"])
 
 
 def test_failed_attempts_without_actions_teach_a_heavy_cart_pole_to_swing_up():
     system, shown = heavy(), []
     for seed in range(4):
         observations = np.round(attempt(30 + seed)[0], 4)
-        fast = infer_actions(recording(observations, COLUMNS), system)
+        fast = with_actions(recording(observations, COLUMNS), system)
         steps = fast.n_steps // 20
         shown.append(
             type(fast)(

@@ -121,6 +121,13 @@ def test_a_state_is_checked(refused, cartpole, state):
         Task.of(cartpole, state)
 
 
+@pytest.mark.parametrize("name", ["fall", "hill-climbing", "random-linear", "segments"])
+def test_learners_that_measure_actions_by_their_limits_want_some(refused, name):
+    attempt = trajectory(np.random.default_rng(0))
+    with refused("the action u0 has no limits"):
+        learned(LEARNERS[name](), [attempt], limit=np.inf)
+
+
 # What the policies do
 
 
@@ -427,6 +434,9 @@ def test_costs_are_needed(refused, costs, message):
         ({"scale": np.ones(2)}, "scale must be 1 positive numbers"),
         ({"scale": np.zeros(1)}, "scale must be 1 positive numbers"),
         ({"settings": np.array([0.5, 2.0, 1.0, 0.0])}, "k > 1"),
+        ({"settings": np.array([2.0, 2.0, 3.0, 0.0])}, "no climb 3"),
+        ({"settings": np.array([2.0, 2.0, 0.0, -1.0])}, "no formula -1"),
+        ({"settings": np.array([2.0, 2.0, np.inf, 0.0])}, "no climb inf"),
     ],
 )
 def test_the_arrays_of_a_policy_are_checked(refused, change, message):

@@ -1,4 +1,6 @@
+import gc
 import json
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +9,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from misstep import Column, Dataset, Outcome, Provenance, Trajectory
-from misstep.formats import FORMATS, load_dataset, read_episodes, save_dataset
+from misstep.formats import (
+    FORMATS,
+    Episode,
+    load_dataset,
+    read_episodes,
+    save_dataset,
+    write_episodes,
+)
 from misstep.formats.lerobot.footer import column_parts
 
 VERSIONS = {"v3.0": "lerobot", "v2.1": "lerobot-v2.1"}
@@ -331,3 +340,14 @@ def test_a_damaged_footer_is_refused_or_read(tmp_path):
         except ValueError:
             refused += 1
     assert 200 < refused < 1900
+
+
+@pytest.mark.parametrize("format", VERSIONS.values())
+def test_nothing_stays_open_where_writing_is_refused(tmp_path, refused, format):
+    dataset = [make(), make(action_columns=(Column("u", "N"),))]
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        with refused("episode_1 has action_columns u"):
+            write_episodes(tmp_path / "a.lerobot", map(Episode.of, dataset), format)
+        gc.collect()
+    assert [str(warning.message) for warning in told] == []

@@ -1,6 +1,7 @@
 import asyncio
 import json
 import shutil
+import socket
 import time
 import zipfile
 from dataclasses import replace
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from misstep import Dataset, Outcome, make_system, rollout, save_dataset
-from misstep.learners import Task
+from misstep.learners import LEARNERS, Task
 from misstep.recordings.marking import Mark
 
 pytest.importorskip("fastapi", reason="the live page needs it: pip install 'misstep[live]'")
@@ -23,6 +24,7 @@ from misstep.live.downloads import upload_suffix
 from misstep.live.guard import Guard, is_local_name
 from misstep.live.hand import Hand
 from misstep.live.jobs import describe, read_upload
+from misstep.live.lesson import Lesson
 from misstep.live.narration import tell_end, tell_trial
 from misstep.live.picture import (
     rounded,
@@ -41,10 +43,11 @@ from misstep.live.protocol import (
     parse,
 )
 from misstep.live.replay import MODULES, PAGE, replay_html
-from misstep.live.server import Page
+from misstep.live.server import Page, open_socket
 from misstep.live.session import Session
-from misstep.live.worker import Worker
+from misstep.live.worker import StoppedError, Worker
 from misstep.mixture import GaussianMixture
+from misstep.runs import CONFIG
 
 # Messages
 
@@ -236,6 +239,45 @@ def test_a_worker_that_is_busy_does_not_hold_up_who_asks_for_more(demonstrations
     assert written.endswith("attempts.h5")
 
 
+def test_who_waited_for_a_worker_that_died_is_told_although_another_is_there(
+    demonstrations, tmp_path
+):
+    save_dataset(demonstrations, tmp_path / "D.h5")
+
+    async def run():
+        worker = Worker()
+        job = {"attempts": str(tmp_path / "D.h5")}
+        first = asyncio.create_task(worker.do("describe", **job))
+        await asyncio.sleep(0)
+        worker._process.kill()
+        worker._process.join()  # and nobody has had a turn to say so
+        try:
+            told = await worker.do("describe", **job)
+            with pytest.raises(StoppedError):
+                await asyncio.wait_for(first, 10)
+            return told
+        finally:
+            worker.stop()
+
+    assert json.loads(asyncio.run(run()))["state"]
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_it_listens_on_addresses_of_both_kinds(host):
+    if host == "::1" and not _has_ipv6():
+        pytest.skip("this machine has no IPv6")
+    with open_socket(host, 0) as listening:
+        socket.create_connection((host, listening.getsockname()[1]), 10.0).close()
+
+
+def _has_ipv6():
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        return False
+    return True
+
+
 # Driving
 
 
@@ -349,16 +391,50 @@ class _Raises:
         raise ValueError("no\nanswer")
 
 
+class Told:
+    """A page without a socket, and what it is told."""
+
+    def __init__(self):
+        self.told = []
+
+    def news(self, message):
+        self.told.append(json.loads(message))
+
+    def frame(self, message):
+        pass
+
+
+def test_a_system_that_cannot_be_had_leaves_the_present_one(tmp_path, refused):
+    async def run():
+        session = Session(tmp_path, "cartpole", {})
+        page = Told()
+        session.join(page)
+        (tmp_path / "flipup").mkdir()
+        (tmp_path / "flipup" / "runs").write_text("no folder")
+        with refused("cannot make the folder"):
+            session.do(page, Message("system", {"name": "flipup"}))
+        assert session.name == session.driving.system.system_id == "cartpole"
+        assert session.attempts.folder == tmp_path / "cartpole"
+        session.close()
+
+    asyncio.run(run())
+
+
+def test_runs_of_any_learner_are_listed_and_counted(tmp_path, monkeypatch):
+    async def run():
+        lesson = Lesson(Worker(), tmp_path, 0, lambda: None)
+        for name in ("002-fall", "007-My_learner.v2", "notes", "x-fall"):
+            (tmp_path / name).mkdir()
+            (tmp_path / name / CONFIG).touch()
+        assert lesson.runs() == ["007-My_learner.v2", "002-fall"]
+        monkeypatch.setitem(LEARNERS._own, "own/learner", LEARNERS["mean"])
+        lesson.learn("own/learner", ["x"], 1, 1).close()
+        assert lesson.run["name"] == "008-own-learner"
+
+    asyncio.run(run())
+
+
 def test_time_goes_on_after_a_policy_that_fails_and_a_disk_that_refuses(tmp_path):
-    class Told:
-        """A page; hears nothing that this is about."""
-
-        def news(self, message):
-            pass
-
-        def frame(self, message):
-            pass
-
     async def until(is_so):
         while not is_so():
             await asyncio.sleep(0.001)
@@ -381,6 +457,7 @@ def test_time_goes_on_after_a_policy_that_fails_and_a_disk_that_refuses(tmp_path
             shutil.rmtree(session.attempts.folder)
             await until(lambda: session.mode == "ended")
             assert "in memory alone" in session.note
+            await until(lambda: page.told[-1].get("note") == session.note)
             assert session.attempts.pending.outcome is Outcome.FAILURE
             session.attempts.folder.mkdir()
             do("keep")
@@ -441,6 +518,15 @@ def test_a_process_killed_between_copy_and_change_takes_nothing_back(demonstrati
     with pytest.raises(ValueError, match="nothing to take back"):
         again.undo()
     assert again.dataset == demonstrations
+
+
+def test_a_mark_is_taken_back_only_where_its_attempt_still_is(demonstrations, tmp_path, refused):
+    attempts = Attempts(tmp_path)
+    (only,) = attempts.add([demonstrations[0]])
+    attempts.mark(only, Mark(outcome=Outcome.UNKNOWN))
+    attempts.path.unlink()  # somebody has taken all of them away
+    with refused("nothing to take back"):
+        Attempts(tmp_path).undo()
 
 
 def test_what_waits_is_in_a_file_until_it_is_kept_once(demonstrations, tmp_path):

@@ -141,6 +141,7 @@ def test_the_page_forbids_everything_from_elsewhere(server):
         "page/%2fetc%2fpasswd",
         "api/download-run/..",
         "api/download-run/..%2f..%2ftoken",
+        "page/icon.svg",
         "api/attempt/-1",
         "api/attempt/abc",
         "api/download/..%2fx",

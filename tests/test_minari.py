@@ -3,13 +3,20 @@ import sys
 import warnings
 
 import gymnasium as gym
+import h5py
 import minari
 import numpy as np
 import pytest
 from minari.data_collector import EpisodeBuffer
 
 from misstep import Column, Dataset, MisstepError, Outcome, Provenance, Trajectory
-from misstep.formats import ReadOptions, load_dataset, read_episodes, save_dataset
+from misstep.formats import (
+    ReadOptions,
+    append_trajectory,
+    load_dataset,
+    read_episodes,
+    save_dataset,
+)
 from misstep.formats.minari import located
 
 STORAGES = {"hdf5": "minari", "arrow": "minari-arrow"}
@@ -228,3 +235,22 @@ def test_metadata_that_is_refused(tmp_path, refused, change, line):
     place.write_text(json.dumps(json.loads(place.read_text()) | change))
     with refused(line):
         load_dataset(path)
+
+
+@pytest.mark.parametrize(
+    "count", [6, np.array([5, 5]), np.array((1, 2.0), dtype=[("a", "i4"), ("b", "f8")]), "five"]
+)
+def test_a_count_of_steps_that_is_another_is_refused(tmp_path, refused, count):
+    path = tmp_path / "d.minari"
+    save_dataset(Dataset([make()]), path)
+    with h5py.File(path / "data" / "main_data.hdf5", "r+") as file:
+        del file["episode_0"].attrs["total_steps"]
+        file["episode_0"].attrs["total_steps"] = count
+    with refused("total_steps is"):
+        load_dataset(path)
+
+
+def test_appending_by_name_adds_to_what_is_there():
+    for seed in (1, 2, 3):
+        append_trajectory("minari:cartpole/grown-v0", make(seed=seed))
+    assert load_dataset("minari:cartpole/grown-v0") == Dataset([make(seed=s) for s in (1, 2, 3)])

@@ -203,3 +203,12 @@ def test_damaged_texts_crash_nothing(tmp_path, refused, monkeypatch):
     path.write_bytes(whole)
     with refused("env_args is damaged"):
         load_dataset(path)
+
+
+def test_an_attribute_of_several_texts_is_refused_in_one_line(tmp_path, refused):
+    path = tmp_path / "a.h5"
+    as_documented(path)
+    with h5py.File(path, "r+") as file:
+        file["data"].attrs["env_args"] = np.array([b"{}", b"{}"])
+    with refused("demo_0: "):
+        load_dataset(path)

@@ -56,6 +56,7 @@ def test_limits_are_those_of_the_spaces_and_further_ones(cartpole):
         ({"rate": [1.0, 2.0]}, "rate limit has 2 numbers, but there are 1 actions"),
         ({"ranges": {"y": (0, 1)}}, "no observation column 'y'; there are: x, x_dot"),
         ({"ranges": {"x": (1, 1)}}, "range of x is 1 .. 1: it is empty"),
+        ({"ranges": {"theta": (4, 5)}}, "range of theta is 4 .. 5: outside -3.14159 .. 3.14159"),
     ],
 )
 def test_limits_that_cannot_be_are_refused(cartpole, refused, given_, message):
@@ -66,6 +67,8 @@ def test_limits_that_cannot_be_are_refused(cartpole, refused, given_, message):
 def test_an_actuator_without_an_end_is_refused(limits, refused):
     with refused("needs finite limits"):
         replace(limits, high=(math.inf,))
+    with refused("needs finite limits"):  # its range is none, and braking would reckon with it
+        replace(limits, low=(-1e308,), high=(1e308,), jerk=(10.0,))
 
 
 # The limiter

@@ -520,6 +520,42 @@ def _ends(log):
     return [event + i * ((len(log) - event) // 3) for i in range(4)]
 
 
+def test_logs_and_trials_that_are_taken_away_leave_the_others_alone(
+    short, demonstrations, tmp_path
+):
+    folder = tmp_path / "run"
+    learn(short, demonstrations, "mean", **OPTIONS, out=folder)
+    kept = {folder / LOGS / "0001.log": b"a log", folder / DRIVEN / "trial_001.h5": b"a trial"}
+    for path, content in kept.items():
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(content)
+    service = ExplorationService(load_run(folder), simulated_time=True, learning=False)
+    assert service.wait(60.0)
+    assert service.start().number == 2
+    for sequence in range(3):
+        service.exchange(State(sequence, sequence * PERIOD, UPRIGHT, over=sequence == 2))
+    service.close()
+    assert {path: path.read_bytes() for path in kept} == kept
+    assert load_dataset(folder / DRIVEN / "trial_002.h5")[0].n_steps == 2
+    assert read_log(folder / LOGS / "0002.log")[0]["system"] == "cartpole"
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"[]",
+        b'{"n_observations": -4, "n_actions": 1}',
+        b'{"n_observations": 1e999, "n_actions": 1}',
+        b'{"n_observations": 99999999999, "n_actions": 1}',
+        b"[" * 100_000,
+    ],
+)
+def test_a_header_that_is_none_is_refused(tmp_path, refused, header):
+    (tmp_path / "a.log").write_bytes(b"MISSTEP1" + len(header).to_bytes(4, "little") + header)
+    with refused("is not a log of a service"):
+        read_log(tmp_path / "a.log")
+
+
 def test_no_log_is_overwritten(tmp_path, refused):
     header = {"n_observations": 1, "n_actions": 1}
     ActionLog(tmp_path / "a.log", header).close()

@@ -165,7 +165,10 @@ def test_garbage_is_read_or_refused_but_nothing_else(message):
     assert -1 <= kind_of(message) < 256
 
 
-@pytest.mark.parametrize("address", ["", "7106", "host:", "host:x", "host:99999", "unix:", ":1"])
+NO_ADDRESSES = ["", "7106", "host:", "host:x", "host:99999", "unix:", ":1", "h:" + "1" * 5000]
+
+
+@pytest.mark.parametrize("address", NO_ADDRESSES)
 def test_addresses_that_are_none_are_refused(refused, address):
     with refused("neither host:port"):
         parse_address(address)
@@ -268,7 +271,7 @@ def test_one_robot_drives_at_a_time(served):
 @pytest.mark.parametrize("transport", TRANSPORTS)
 def test_who_does_not_know_the_token_is_told_nothing(served, transport):
     one = served(transport)
-    for token in ("", "S3cret", "s3cret\0", "ß"):
+    for token in ("", "S3cret", "s3cret\0", "ß", "\ud800"):
         with pytest.raises(MisstepError, match="the token is not the right one"):
             RobotClient(one.address, token)
     link = open_link(one.address, 5.0)
@@ -325,6 +328,66 @@ def test_there_is_an_end_to_clients_and_to_messages(served, short):
     plain.close()
 
 
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_who_says_nothing_is_let_go(served, monkeypatch, transport):
+    for module in ("socket_server", "websocket_server"):
+        monkeypatch.setattr(f"misstep.robot.{module}.HELLO_TIMEOUT", 0.05)
+    one = served(transport)
+    link = open_link(one.address, 5.0)
+    with pytest.raises(ConnectionError):
+        link.receive(30.0)
+    link.close()
+    until(lambda: not one.hub._sessions)
+
+
+def in_a_frame(message):
+    """Return a short message as a frame of a stream."""
+    return struct.pack("<I", len(message)) + message
+
+
+def in_a_websocket_frame(message):
+    """Return a short message as a binary frame of a browser."""
+    return bytes([0x82, 0x80 | len(message), 0, 0, 0, 0]) + message
+
+
+@pytest.mark.parametrize(
+    ("transport", "frame"), [("tcp", in_a_frame), ("websocket", in_a_websocket_frame)]
+)
+def test_who_does_not_read_is_let_go_and_holds_nobody_up(served, transport, frame):
+    one = served(transport)
+    host, port = parse_address(one.address.removeprefix("ws://"))
+    plain = socket.create_connection((host, port), timeout=30.0)
+    if transport == "websocket":
+        plain.sendall(
+            b"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+        )
+        assert plain.recv(4096).startswith(b"HTTP/1.1 101")
+    plain.sendall(frame(encode(Kind.HELLO, {"token": SECRET, "role": "drive", "version": VERSION})))
+    with pytest.raises(ConnectionError):  # noqa: PT012
+        while True:
+            plain.sendall(1000 * frame(encode(Kind.STATUS)))
+    plain.close()
+    with one.client(role="watch") as person:
+        assert person.stop()["stopped"]
+    until(lambda: not one.hub._sessions)
+
+
+def test_nothing_stands_between_a_robot_and_its_service(served, monkeypatch):
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:1")
+    monkeypatch.delenv("no_proxy", raising=False)
+    with served("websocket").client() as client:
+        assert client.status()["trials"] == 0
+
+
+def test_a_socket_of_somebody_else_stays(served, tmp_path, refused):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as other:
+        other.bind(f"{tmp_path}/s")
+        with refused("cannot listen at"):
+            served()
+        assert (tmp_path / "s").is_socket()
+
+
 def test_a_socket_that_a_killed_service_left_is_used_again(served, tmp_path, refused):
     left = socket.socket(socket.AF_UNIX)
     left.bind(f"{tmp_path}/s")
@@ -338,7 +401,8 @@ def test_a_socket_that_a_killed_service_left_is_used_again(served, tmp_path, ref
 
 
 def test_nobody_at_an_address_is_one_line(refused, tmp_path):
-    for address in (f"unix:{tmp_path}/none", "127.0.0.1:1", "ws://127.0.0.1:1"):
+    nowhere = ("127.0.0.1:1", "a..b:1", "ws://127.0.0.1:1", "ws://", "ws://a:b", "ws://a:99999")
+    for address in (f"unix:{tmp_path}/none", *nowhere):
         with refused("nobody answers at"):
             RobotClient(address, SECRET)
 
@@ -424,6 +488,7 @@ def test_a_remote_system_is_described_by_the_robot_or_by_its_parameters(short, o
         ({"low": "a"}, "low is 'a': write numbers"),
         ({"high": "1,2"}, "high is '1,2': write 1 numbers"),
         ({"observation_low": "nan,0,0,0"}, "observation_low is"),
+        ({"low": "3", "high": "-3"}, "low is '3' and high is '-3': write the smaller first"),
     ],
 )
 def test_a_description_that_is_none_is_refused(short, refused, wrong, message):
@@ -474,6 +539,84 @@ def test_a_robot_that_is_left_alone_goes_to_its_safe_action(monkeypatch, tmp_pat
     assert system.actions[-1] == pytest.approx(-1.0)
     server.close()
     hub.close()
+
+
+class Fragile(Watched):
+    """One that fails once."""
+
+    def step(self, action):
+        if len(self.actions) == 2:
+            self.actions.append(math.nan)
+            raise ZeroDivisionError("the motor")
+        return super().step(action)
+
+
+def test_a_robot_that_fails_on_its_way_is_watched_in_the_next_episode_too():
+    system, clock = Fragile(make_system("cartpole", stop_at_fall=False)), Clock()
+    hub = SystemHub(system, SECRET, watchdog=0.3, clock=clock)
+    for n_steps in (2, 3):
+        hub.reset(1)
+        while len(system.actions) < n_steps:
+            hub.step((9.0,))
+        if n_steps == 3:
+            hub.step((9.0,))
+        clock.now += 0.4
+        until(lambda: not hub._in_episode)
+    hub.close()
+    assert system.actions[-2:] == [9.0, 0.0]
+
+
+def test_there_is_an_end_to_the_clients_of_a_robot(short, tmp_path):
+    hub = SystemHub(short, SECRET)
+    server = SocketServer(hub, f"unix:{tmp_path}/robot")
+    links = [open_link(server.address, 5.0) for _ in range(MOST_CLIENTS)]
+    until(lambda: len(hub._sessions) == MOST_CLIENTS)
+    links.append(open_link(server.address, 5.0))
+    assert f"{MOST_CLIENTS} clients already" in decode(links[-1].receive(5.0))["error"]
+    for link in links:
+        link.close()
+    until(lambda: not hub._sessions)
+    server.close()
+    hub.close()
+
+
+def test_a_robot_is_no_service_and_a_service_no_robot(served, offered, refused, monkeypatch):
+    with refused("a robot answers, and no exploration service"):
+        RobotClient(offered, SECRET)
+    monkeypatch.setenv(TOKEN, SECRET)
+    with refused("an exploration service answers, and no robot"):
+        RemoteSystem(address=served("tcp").address)
+
+
+class Babbler:
+    """A robot that answers a HELLO, and then sends what nobody reads."""
+
+    def __init__(self, description):
+        self.description, self.send, self.n_clients = description, None, 0
+
+    def open(self, send):
+        self.send = send
+        self.n_clients += 1
+        return self
+
+    def receive(self, message):
+        is_hello = kind_of(message) == Kind.HELLO
+        self.send(encode(Kind.WELCOME, self.description) if is_hello else bytes(LONGEST + 1))
+        return True
+
+    def close(self):
+        pass
+
+
+def test_a_robot_that_says_too_much_is_connected_to_anew(short, refused, tmp_path):
+    babbler = Babbler(describe_system(short))
+    server = SocketServer(babbler, f"unix:{tmp_path}/robot")
+    robot = RemoteSystem(address=server.address)
+    for n_clients in (1, 2):
+        with refused("at most"):
+            robot.reset(seed=1)
+        assert babbler.n_clients == n_clients
+    server.close()
 
 
 # Commands

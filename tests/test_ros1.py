@@ -14,6 +14,7 @@ import misstep
 from misstep.paper.calibration import FIRST
 from misstep.paper.experiments import PAPER_DONUT
 from misstep.robot.log import Event, read_log
+from misstep.robot.ros1.recorder import BagRecorder
 from misstep.runs import load_run
 
 pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
@@ -107,6 +108,15 @@ def test_nothing_is_lost_when_roscore_is_killed_and_started_again(graph, tmp_pat
     graph.stop(simulation)
     assert untimed(load_run(tmp_path / "run").trials) == untimed(expected.trials)
     assert json.loads((tmp_path / "result.json").read_text())["trials"] == 6
+
+
+def test_a_node_that_is_terminated_ends_in_order(graph):
+    node = graph.node("simulate", "cartpole")
+    until(lambda: "/effort_controller/command" in graph.call("rostopic", "list"), "the node")
+    node.terminate()
+    assert node.wait(30.0) == 143
+    assert "misstep: terminated" in node.said()
+    assert "steps, " in node.said()
 
 
 def trials(folder):
@@ -216,3 +226,18 @@ def test_without_a_roscore_there_is_one_line(tmp_path):
     assert done.stderr.splitlines() == [
         "misstep: error: no roscore answers at http://127.0.0.1:1: start one, or set ROS_MASTER_URI"
     ]
+
+
+def test_a_bag_that_is_taken_away_leaves_the_others_alone(tmp_path):
+    recorder = BagRecorder(tmp_path)
+    for n_attempts in (2, 1):
+        for _ in range(n_attempts):
+            recorder.begin()
+            recorder.effort("command", float(n_attempts), 1.0)
+            recorder.end()
+        if n_attempts == 2:
+            (tmp_path / "attempt_000.bag").unlink()
+            second = (tmp_path / "attempt_001.bag").read_bytes()
+    kept = ["attempt_001.bag", "attempt_002.bag"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == kept
+    assert (tmp_path / "attempt_001.bag").read_bytes() == second

@@ -167,6 +167,11 @@ def test_a_service_answers_whoever_speaks_as_ros_2_does(join, raw):
     assert (response.success, response.message) == (True, "stopped")
     number, _, _, gid = struct.unpack("<qqB16s", answer.attachment.to_bytes())
     assert (number, gid.rstrip(b"\0")) == (41, b"client.")
+    # Whoever does not is told so, and the service goes on.
+    for told in ({}, {"attachment": b"short"}, {"payload": b"x", "attachment": attachment}):
+        (refusal,) = session.get(key, target=zenoh.QueryTarget.ALL_COMPLETE, **told)
+        assert refusal.ok is None
+    assert answers()[0] is not None
 
 
 def test_a_refusal_and_silence_reach_the_caller(join):

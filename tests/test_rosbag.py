@@ -330,6 +330,19 @@ def test_what_comes_before_all_columns_are_there_is_left_out(tmp_path):
     assert any("3 observations at the start left out" in note for note in ending.notes)
 
 
+@pytest.mark.parametrize(("until", "is_held"), [(3.0, True), (9.99, False)])
+def test_a_topic_that_falls_silent_before_the_end_is_noted(tmp_path, until, is_held):
+    with Recording(place(tmp_path, "rosbag"), "rosbag") as bag:
+        for k in range(1000):
+            bag.joints(k * 0.01, ["a"], [k])
+            if k % 20 == 0 and k * 0.01 <= until:  # at a lower rate
+                bag.joints(k * 0.01 + 0.001, ["b"], [k], topic="/other")
+            bag.number(k * 0.01, "/cmd", k)
+    ((_, block, ending),) = episodes(place(tmp_path, "rosbag"))
+    assert block.observations[-1, 1] == 20 * int(until / 0.2)
+    assert ("a topic fell silent: its last observation was held" in ending.notes) == is_held
+
+
 @pytest.mark.parametrize("kind", SUFFIXES)
 def test_one_bag_many_episodes(tmp_path, kind):
     path = place(tmp_path, kind)
@@ -496,3 +509,19 @@ def test_a_piece_unpacks_to_what_was_packed_or_not_at_all(refused):
             opening._unpacked(opening._lz4(), damaged)
     with refused("unpacks to more than 699 bytes"):
         opening._unpacked(opening._lz4(), packed, 699)
+
+
+def test_a_joint_without_a_name_does_not_shift_the_others(tmp_path):
+    path = tmp_path / "a.bag"
+    with Recording(path, "rosbag") as bag:
+        for i in range(5):
+            bag.joints(i / 10, ["", "cart"], [-1.0, i])
+    (episode,) = read_episodes(path, ReadOptions(("/joint_states.position[cart]",)))
+    assert joined(episode).observations.tolist() == [[0], [1], [2], [3], [4]]
+
+
+def test_a_file_may_have_any_name(tmp_path):
+    for name in ("bag", "bag.mcap", "a b.mcap"):
+        save_dataset(Dataset([make()]), tmp_path / name, "mcap")
+        assert (tmp_path / name).is_file()
+    assert sorted(os.listdir(tmp_path)) == ["a b.mcap", "bag", "bag.mcap"]

@@ -77,6 +77,14 @@ def test_merits_rank_by_what_followed(shown):
         merits([replace(shown[0], costs=None)], outlook)
 
 
+def test_costs_that_tell_nothing_are_refused(refused, system, shown):
+    alike = tuple(replace(t, costs=np.ones(t.n_steps)) for t in shown)
+    with refused("all steps of all attempts cost the same"):
+        DonutIncremental().policy(
+            Task.of(system, STATE), Evidence(alike, ()), np.random.default_rng(0)
+        )
+
+
 def test_what_was_kept_is_explored_less(system, evidence):
     task = Task.of(system, STATE)
     policy = DonutIncremental().policy(task, evidence, np.random.default_rng(0))
@@ -107,3 +115,27 @@ def test_segments_needs_a_failure_time(system, evidence):
     untimed = tuple(replace(t, failure_step=None) for t in evidence.demonstrations)
     with pytest.raises(MisstepError, match="segments needs the time of at least one failure"):
         Segments().policy(Task.of(system, STATE), Evidence(untimed, ()), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    ("learner", "change", "message"),
+    [
+        ("segments", {"scale": np.zeros(1)}, "scale must be 1 positive numbers"),
+        ("segments", {"repulsion": np.array(np.nan)}, "repulsion is nan"),
+        ("donut-incremental", {"scale": np.ones(2)}, "scale must be 1 positive numbers"),
+        (
+            "donut-incremental",
+            {"merit_means": np.zeros((1, 4)), "merit_covariances": np.eye(4)[None]},
+            "merit has 4 columns, but the task has 2 of state",
+        ),
+    ],
+)
+def test_damaged_policies_are_refused(refused, system, learner, change, message):
+    arrays = {"weights": np.ones(1), "means": np.zeros((1, 3)), "covariances": np.eye(3)[None]}
+    second = "bad_{}" if learner == "segments" else "merit_{}"
+    arrays |= {second.format(name): values for name, values in arrays.items()}
+    arrays |= {"scale": np.ones(1), "repulsion": np.array(0.5)}
+    task = Task.of(system, STATE)
+    LEARNERS[learner].restore(task, arrays)
+    with refused(message):
+        LEARNERS[learner].restore(task, arrays | change)

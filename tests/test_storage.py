@@ -8,7 +8,7 @@ import time
 import pytest
 
 from misstep.errors import MisstepError
-from misstep.storage import atomic_write, write_json, write_text
+from misstep.storage import atomic_write, read_json, write_json, write_text
 
 SLOW_WRITER = """
 import sys
@@ -135,7 +135,7 @@ def test_json(tmp_path):
     write_json(path, {"b": [1, None], "a": 0.1}, sort_keys=True)
     assert list(json.loads(path.read_text())) == ["a", "b"]
     write_json(path, {"b": [1, None], "a": 0.1})
-    assert json.loads(path.read_text()) == {"b": [1, None], "a": 0.1}
+    assert json.loads(path.read_text()) == read_json(path) == {"b": [1, None], "a": 0.1}
     assert list(json.loads(path.read_text())) == ["b", "a"]
 
 
@@ -146,3 +146,16 @@ def test_json_refuses_what_it_cannot_say(tmp_path, value):
     with pytest.raises(MisstepError, match=r"a\.json as JSON"):
         write_json(path, value)
     assert path.read_text() == "old"
+
+
+def test_json_that_is_damaged_or_endless_is_refused(tmp_path, refused):
+    path = tmp_path / "a.json"
+    with refused(r"cannot read .*a\.json"):
+        read_json(path)
+    path.write_text('{"a": [1,')
+    with refused(r"a\.json is not valid JSON"):
+        read_json(path)
+    with path.open("ab") as file:
+        file.truncate(65 * 2**20)  # takes no room on the disk
+    with refused(r"a\.json is too large"):
+        read_json(path)

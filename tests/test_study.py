@@ -25,8 +25,9 @@ from misstep.study import load_study, run_study
 from misstep.study.cells import CellResult, cell_file, run_cell
 from misstep.study.figures import learning_curve
 from misstep.study.page import rate_colour
-from misstep.study.run import held_study
-from misstep.study.table import TIMING, Quantile, censored_quantile
+from misstep.study.run import _film, held_study
+from misstep.study.table import TIMING, Measured, Quantile, censored_quantile, summarise
+from misstep.workers import Tally, silent
 
 needs_ray = pytest.mark.skipif(
     importlib.util.find_spec("ray") is None,
@@ -279,6 +280,54 @@ def test_learners_are_compared_on_the_same_demonstrations(spec):
     assert len({tuple(demonstrations) for demonstrations in seen}) == 3
 
 
+class WorksOnce:
+    """A policy that fails in its second attempt, as one may under a `test_set`."""
+
+    def __init__(self, policy):
+        self.policy, self.begun = policy, 0
+
+    def reset(self):
+        self.begun += 1
+        if self.begun > 1:
+            raise misstep.MisstepError("it works once")
+        self.policy.reset()
+
+    def __call__(self, observation):
+        return self.policy(observation)
+
+
+def test_a_run_that_ends_in_an_error_has_not_succeeded(spec, monkeypatch):
+    class Once(LEARNERS["fall"]):
+        def policy(self, task, evidence, rng):
+            return WorksOnce(super().policy(task, evidence, rng))
+
+    monkeypatch.setitem(LEARNERS._own, "test-study-once", Once)
+    cell = next(cell for cell in load_study(spec).cells if cell.learner.name == "fall")
+    cell = replace(cell, learner=replace(cell.learner, name="test-study-once"))
+    result = run_cell(cell)
+    assert (result.status, result.error) == ("error", "it works once")
+    assert result.outcomes[-1] == "success"
+    assert result.trials_to_success is None
+    assert summarise([Measured(cell, result)])[0].success == (0, 1)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda values: values.pop("cell"),
+        lambda values: values.update(outcomes=None),
+        lambda values: values.update(timing=[1.0, 2.0]),
+        lambda values: values["timing"].pop("wall_seconds"),
+    ],
+)
+def test_a_damaged_result_is_told_in_one_line(whole, spec, tmp_path, refused, change):
+    values = json.loads(cell_file(whole, load_study(spec).cells[0]).read_text())
+    change(values)
+    path = write(tmp_path, json.dumps(values), "000.json")
+    with refused("000.json is no result of a study: delete it"):
+        CellResult.load(path)
+
+
 # The arithmetic of the tables
 
 times = st.lists(st.tuples(st.integers(1, 20), st.booleans()), min_size=1, max_size=30)
@@ -382,6 +431,19 @@ def test_the_page_holds_everything_and_reaches_outside_for_nothing(whole, spec):
     assert 3 <= len(videos) == page.count("<video")
     assert page.count("data:image/png") == 4
     assert "every run went through" in page
+
+
+def test_a_video_is_of_its_cell_also_when_a_lost_one_comes_back(whole, spec, tmp_path):
+    falls = [c for c in load_study(spec).cells if c.learner.name == "fall"][:2]
+    made = [Measured(cell, CellResult.load(cell_file(whole, cell))) for cell in falls]
+    lost = [Measured(falls[0], CellResult("lost", "lost: killed")), made[1]]
+    tally = Tally(silent, 0)
+    [before] = _film(tmp_path, lost, 1, tally)
+    [after] = _film(tmp_path, made, 1, tally)
+    assert (before.video.cell, after.video.cell) == (falls[1], falls[0])
+    assert before.video.path != after.video.path
+    assert before.video.path.exists()
+    assert after.video.path.exists()
 
 
 def test_one_worker_killed_and_resumed_gives_the_same_tables(whole, tmp_path):

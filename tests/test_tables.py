@@ -3,6 +3,7 @@ import io
 import os
 import subprocess
 import sys
+from functools import cache
 
 import numpy as np
 import pyarrow as pa
@@ -24,6 +25,7 @@ from misstep.formats import (
     write_episodes,
 )
 from misstep.formats.format import Block, Ending, Episode, Header, joined
+from misstep.inspection import inspect_file
 
 SUFFIXES = ("csv", "tsv", "parquet")
 COLUMNS = (Column("x", "m"), Column("theta", "rad"))
@@ -147,6 +149,40 @@ def test_appending_adds_one_at_the_end(tmp_path, suffix):
     with pytest.raises(MisstepError, match="has action_columns u"):
         append_trajectory(path, make(action_columns=(Column("u", "N"),)))
     assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_actions_may_come_before_the_observations(tmp_path, suffix):
+    whole = make(4)
+    blocks = [
+        Block(whole.observations[:0], whole.actions, whole.costs),
+        Block(whole.observations, whole.actions[:0], whole.costs[:0]),
+    ]
+    header, ending = Episode.of(whole).header, Episode.of(whole).ending
+    path = tmp_path / f"a.{suffix}"
+    write_episodes(path, [Episode(header, iter(blocks), ending)])
+    assert load_dataset(path) == Dataset([whole])
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_the_ending_is_asked_for_after_the_last_block(tmp_path, suffix):
+    seen = 0
+
+    def blocks():
+        nonlocal seen
+        for start in range(0, 20, 5):
+            seen = start + 5
+            yield Block(np.arange(start, seen)[:, None] * 1.0, np.empty((0, 0)))
+
+    def ending():
+        return Ending(Outcome.FAILURE, seen - 1)
+
+    header = Header(0.1, COLUMNS[:1], (), Provenance("", {}, "person", None, ""))
+    path = tmp_path / f"a.{suffix}"
+    write_episodes(path, [Episode(header, blocks(), cache(ending))])
+    ((_, block, ended),) = read(path)
+    assert len(block.observations) == 20
+    assert (ended.outcome, ended.failure_step) == (Outcome.FAILURE, 19)
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -290,6 +326,17 @@ def test_parquet_of_others_is_read(tmp_path):
         ("x,x\n1,2\n3,4\n", {}, "both named 'x'"),
         ("x,y\n1,2\n3,4\n", {"rate": None}, "give --rate in Hz, or name the column of times"),
         ("t,y\n1,2\n1,4\n", {"rate": None}, "line 3: time 1.0 s comes after 1.0 s"),
+        (
+            "t,y\n1,2\ninf,4\n",
+            {"rate": None},
+            "line 3: the time is inf s: every time has to be finite",
+        ),
+        ("t,y\n-inf,2\n1,4\n", {"rate": None}, "line 2: the time is -inf s"),
+        (
+            "s,y\n1,2\n2,4\n",
+            {"rate": None, "time": "s", "time_unit": "h"},
+            "there are: s, ms, us, ns",
+        ),
         ("x,y\n1,2\n3,4\n", {"observations": ("z",)}, "no column 'z'; there are: x, y"),
         (
             "1,2\n3,4\n",
@@ -303,6 +350,11 @@ def test_parquet_of_others_is_read(tmp_path):
         (b"x,y\n1,2\n\xff\xfe,3\n", {}, "line 3 is no text in UTF-8"),
         ('x,y\n1,2\n"3,4\n', {}, "line 3: "),
         ("x,misstep\n1,{}\n2,\n", {}, "line 2: misstep's annotation is damaged"),
+        (
+            'x,misstep\n1,"{""misstep"": 2}"\n2,\n',
+            {},
+            "line 2: misstep's annotation is of a newer misstep",
+        ),
         (b"1," + b"1" * 3_000_000, {}, "more than 1048576 bytes"),
         (b"\x00" * 100, {}, "a.csv"),
         ("x," * 10_001 + "x\n", {}, "10002 columns: at most 10000"),
@@ -315,6 +367,45 @@ def test_bad_tables_are_refused_in_one_line(table, refused, text, options, reaso
     if options.get("rate", 50.0) is not None:
         with refused(r"a\.csv"):
             load_dataset(path)
+
+
+def test_rows_taken_out_by_hand_are_noticed_where_a_step_is_numbered(tmp_path, refused):
+    path = tmp_path / "a.csv"
+    save_dataset(Dataset([make(20, outcome=Outcome.FAILURE, failure_step=20)]), path)
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[:5] + lines[8:]))
+    with refused(r"a\.csv: episode_0: failure_step is 20, but there are 18 observations"):
+        write_episodes(tmp_path / "b.h5", read_episodes(path))
+    assert not (tmp_path / "b.h5").exists()
+    with refused("failure_step is 20"):
+        inspect_file(path)
+
+
+def test_damage_in_the_middle_of_an_episode_is_told_in_one_line(tmp_path, refused):
+    path = tmp_path / "a.parquet"
+    save_dataset(Dataset([make(200_000)]), path)
+    with pq.ParquetFile(path) as file:
+        assert file.metadata.num_row_groups > 1
+        at = file.metadata.row_group(file.metadata.num_row_groups - 1).column(2).data_page_offset
+    with open(path, "r+b") as file:
+        file.seek(at)
+        file.write(b"\xff" * 400)
+    with refused(r"a\.parquet: episode_0: it is damaged"):
+        load_dataset(path)
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_rate_has_to_be_positive(refused, rate):
+    with refused("the rate is .*: it has to be positive"):
+        ReadOptions(rate=rate)
+
+
+def test_a_rate_makes_up_for_times_that_are_no_numbers(table):
+    path = table("timestamp,x,F\n12:00:00,1,2\n12:00:01,3,4\n12:00:02,5,6\n")
+    ((header, block, _),) = read(path, rate=1.0, observations=("x",), actions=("F",))
+    assert block.observations.tolist() == [[1], [3], [5]]
+    assert header.dt == 1.0
+    assert header.provenance.notes == ("columns left out: timestamp",)
 
 
 def test_an_action_may_be_missing_in_the_last_row_only(table, refused):

@@ -71,6 +71,15 @@ def test_a_tally_reports_what_is_done():
 
 def test_workers_are_checked():
     assert check_workers(3) == 3
-    assert check_workers(None) == (os.cpu_count() or 1)
+    assert check_workers(None) == len(os.sched_getaffinity(0))
     with pytest.raises(MisstepError, match="workers is 0"):
         check_workers(0)
+
+
+def test_there_is_one_worker_for_each_core_that_the_process_may_use():
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    try:
+        assert check_workers(None) == 1
+    finally:
+        os.sched_setaffinity(0, before)

@@ -1,6 +1,5 @@
 """A campaign: slices of every target in turn, until all are done or the time is over."""
 
-import json
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -9,6 +8,8 @@ from typing import Any
 
 from fuzzing.cases import Target
 from fuzzing.workers import Slice, Worker
+from misstep.errors import MisstepError
+from misstep.storage import read_json, write_json
 
 _MOST_KEPT = 50  # findings of a target that are told in full
 _PAUSE = 0.02  # s
@@ -27,6 +28,11 @@ class Campaign:
         Of each target; None: as many as each is worth.
     state : Path or None
         JSON file of the counts.
+
+    Raises
+    ------
+    MisstepError
+        If the file counts cases of another seed.
     """
 
     def __init__(
@@ -35,7 +41,10 @@ class Campaign:
         self._targets, self._seed, self._state = targets, seed, state
         self.counts: dict[str, dict[str, Any]] = {}
         if state is not None and state.exists():
-            self.counts = json.loads(state.read_text())["targets"]
+            told = read_json(state)
+            if told["seed"] != seed:
+                raise MisstepError(f"{state} counts cases of seed {told['seed']}, not of {seed}")
+            self.counts = told["targets"]
         for target in targets:
             self.counts.setdefault(target.name, _nothing())
             self.counts[target.name]["planned"] = target.cases if cases is None else cases
@@ -114,10 +123,7 @@ class Campaign:
             name: sum(count[name] for count in self.counts.values())
             for name in ("planned", "tried", "taken", "refused", "findings")
         }
-        told = {"seed": self._seed, "total": total, "targets": self.counts}
-        new = self._state.with_suffix(".new")
-        new.write_text(json.dumps(told, indent=1))
-        new.replace(self._state)
+        write_json(self._state, {"seed": self._seed, "total": total, "targets": self.counts})
 
 
 def _joined(intervals: list[list[int]]) -> list[list[int]]:

@@ -17,8 +17,8 @@ EFFORT = 0.005
 class StateCost:
     """Σ w (1 − cos e) on angles, Σ ½ w e² on other columns, e the distance from the goal.
 
-    Beyond `FREE_SHARE` of a column's limit L a wall ½ · 2000 · (excess/L)² is added, and
-    0.005 u² for an action u in units of the actuator's limit.
+    Beyond `FREE_SHARE` of a column's limit L a wall ½ · `WALL` · (excess/L)² is added. A planner
+    adds `EFFORT` u² for an action u in units of the actuator's limit; a call here knows no action.
 
     Parameters
     ----------

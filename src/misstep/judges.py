@@ -88,7 +88,8 @@ def parse_predicate(text: Judge, columns: Sequence[Column], what: str = "the pre
     Returns
     -------
     Formula
-        Maps an observation, shape (n,), to a bool. A comparison with no number (0/0) is false.
+        Maps an observation, shape (n,), to a bool. With no number (0/0) every comparison is false
+        but ``!=``.
 
     Raises
     ------

@@ -249,7 +249,7 @@ def evaluate(system: System, policy: Policy, *, episodes: int = 100, seed: int =
     Raises
     ------
     MisstepError
-        If `episodes` is below 1.
+        If `episodes` is below 1 or `seed` below 0.
     """
     if episodes < 1:
         raise MisstepError(f"episodes is {episodes}: at least one is needed")

@@ -1,8 +1,8 @@
 """Parameters that explain themselves: a frozen dataclass whose fields carry unit, meaning, range.
 
 One such dataclass is at the same time the documentation, the configuration, the arguments on the
-command line and the Python interface of a system or a demonstrator. What a field may hold is
-written once, beside it, and checked whenever an instance is made.
+command line and the Python interface of a system, a demonstrator or a learner. What a field may
+hold is written once, beside it, and checked whenever an instance is made.
 """
 
 import sys

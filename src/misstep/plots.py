@@ -25,6 +25,8 @@ MODEL = "#d1495b"
 EXPLORATION = "#2a9d4e"
 """The latest exploration is green, as in the paper."""
 PAPER = "#e09f3e"
+BAR_STEP = 0.27
+"""Between the bars of one trajectory in `plot_costs`, one a horizon; the middle one is at 0."""
 SERIES = ("#33658a", "#d1495b", "#7b4b94", "#e09f3e", "#2a9d4e")
 
 _STYLE: Any = {
@@ -138,7 +140,7 @@ def plot_costs(axes: Axes, costs: Array, horizons: Sequence[float], colour: str 
     shades = (0.25, 0.55, 1.0)
     for column, (horizon, shade) in enumerate(zip(horizons, shades, strict=True)):
         axes.bar(
-            numbers + (column - 1) * 0.27,
+            numbers + (column - 1) * BAR_STEP,
             costs[:, column],
             width=0.26,
             color=colour,

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import entry_points
 from typing import Generic, TypeVar
 
-from misstep.errors import MisstepError
+from misstep.errors import MisstepError, reason_of
 
 T = TypeVar("T")
 
@@ -48,11 +48,18 @@ class Registry(Mapping[str, T], Generic[T]):
         return enter
 
     def __getitem__(self, name: str) -> T:
+        """Return an entry; raise MisstepError if there is none or its package cannot be loaded."""
         if name in self._own:
             return self._own[name]
         for point in entry_points(group=self.group):
             if point.name == name:
-                entry: T = point.load()
+                try:
+                    entry: T = point.load()
+                except (ImportError, AttributeError) as error:
+                    raise MisstepError(
+                        f"the {self.kind} {name!r} is {point.value} of an installed package, which "
+                        f"cannot be loaded ({reason_of(error)}): mend or uninstall that package"
+                    ) from error
                 return entry
         raise MisstepError(f"no {self.kind} named {name!r}; there are: {', '.join(self)}")
 

@@ -12,7 +12,6 @@ process killed at any instant therefore loses at most the trial in flight.
 """
 
 import io
-import json
 import os
 import struct
 import zipfile
@@ -29,7 +28,7 @@ from misstep.errors import MisstepError, reason_of
 from misstep.formats import load_dataset, save_dataset
 from misstep.learners import LEARNERS, LearnedPolicy, Learner, Task
 from misstep.parameters import ParameterValue, build_parameters
-from misstep.storage import atomic_write, write_json
+from misstep.storage import atomic_write, make_folder, read_json, write_json
 from misstep.systems import System, make_system
 from misstep.trajectory import Dataset, Outcome, Trajectory
 from misstep.version import __version__, command_line
@@ -224,29 +223,11 @@ def load_run(folder: str | os.PathLike[str]) -> Run:
             run.computing_seconds.append(float(arrays["computing_seconds"]))
         except KeyError as error:
             raise MisstepError(f"{path}: policies/{name}.npz lacks the array {error}") from error
-        except (TypeError, ValueError) as error:
+        except (ArithmeticError, IndexError, TypeError, ValueError) as error:
             reason = reason_of(error)
             raise MisstepError(f"{path}: policies/{name}.npz holds no policy: {reason}") from error
         run.trials.append(load_dataset(file)[0])
     return run
-
-
-def make_folder(path: Path) -> None:
-    """Make a folder and those above it; raise MisstepError where that is not possible."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise MisstepError(f"cannot make the folder {path}: {error.strerror}") from error
-
-
-def read_json(path: Path) -> Any:
-    """Read a JSON file; raise MisstepError if it is missing or damaged."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise MisstepError(f"cannot read {path}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise MisstepError(f"{path} is not valid JSON: {error}") from error
 
 
 def _load_config(path: Path) -> RunConfig:
@@ -284,6 +265,8 @@ def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
                 raise MisstepError(f"{path} unpacks to more than any policy holds")
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
+    except MisstepError:
+        raise
     except _DAMAGE as error:
         raise MisstepError(f"cannot read {path}: {reason_of(error)}") from error
     for name, array in arrays.items():

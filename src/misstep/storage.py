@@ -3,18 +3,24 @@
 A file is written under a temporary name on the same file system, flushed to the disk, and then
 renamed over the old one in a single step. Whoever reads sees the old file or the new one; a
 process killed at any instant leaves at worst a hidden folder ``.NAME.XXXX.tmp`` behind.
+
+Beside that, what goes with it: reading JSON back, folders, names of files.
 """
 
 import atexit
 import json
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from misstep.errors import MisstepError
+
+_LARGEST_JSON = 64 * 2**20  # bytes
 
 _hidden: set[Path] = set()
 
@@ -109,6 +115,39 @@ def write_json(path: str | os.PathLike[str], value: object, *, sort_keys: bool =
     except (TypeError, ValueError) as error:
         raise MisstepError(f"cannot write {path} as JSON: {error}") from error
     write_text(path, text + "\n")
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file.
+
+    Raises
+    ------
+    MisstepError
+        If it is missing, larger than 64 MiB, or no JSON.
+    """
+    try:
+        if path.stat().st_size > _LARGEST_JSON:
+            raise MisstepError(f"{path} is too large: more than {_LARGEST_JSON} bytes of JSON")
+        return json.loads(path.read_text(encoding="utf-8"))
+    except MisstepError:
+        raise
+    except OSError as error:
+        raise MisstepError(f"cannot read {path}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise MisstepError(f"{path} is not valid JSON: {error}") from error
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it; raise MisstepError where that is not possible."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise MisstepError(f"cannot make the folder {path}: {error.strerror}") from error
+
+
+def as_file_name(text: str) -> str:
+    """Return a text as a part of a file's name: letters, digits, ``_``, ``.`` and ``-``."""
+    return re.sub(r"[^\w.-]", "-", text)
 
 
 @contextmanager

@@ -31,3 +31,6 @@ UNITS: dict[str, tuple[str, float]] = {
     "rpm": ("rad/s", math.pi / 30.0),
 }
 """Unit by unit: the one it is brought to, and how many of those it is."""
+
+TURNS = {"rad": 2.0 * math.pi, "deg": 360.0}
+"""A full turn, in each unit in which columns are taken for angles that may wrap."""

@@ -36,19 +36,20 @@ class Lost(NamedTuple):
 
 
 class Tally:
-    """Waits for work in progress and reports each piece as it is done.
+    """Counts work and reports each piece as it is done; waits for what is in progress.
 
     Parameters
     ----------
     progress : callable
         Called with how much is done, how much there is, and what was done last.
     total : int
+    done : int
+        What was done before.
     """
 
-    def __init__(self, progress: Progress, total: int) -> None:
-        self.done = 0
+    def __init__(self, progress: Progress, total: int, done: int = 0) -> None:
+        self.total, self.done = total, done
         self._progress = progress
-        self._total = total
         self._expected: dict[Future[None], str] = {}
 
     def expect(self, future: Future[None], what: str) -> None:
@@ -65,11 +66,11 @@ class Tally:
     def count(self, what: str) -> None:
         """Report one more piece as done."""
         self.done += 1
-        self._progress(self.done, self._total, what)
+        self._progress(self.done, self.total, what)
 
 
 def check_workers(workers: int | None) -> int:
-    """Return how many processes to use, one a core for None.
+    """Return how many processes to use: for None, one for each core that this process may use.
 
     Raises
     ------
@@ -78,7 +79,11 @@ def check_workers(workers: int | None) -> int:
     """
     if workers is not None and workers < 1:
         raise MisstepError(f"workers is {workers}: at least one process is needed")
-    return workers or os.cpu_count() or 1
+    if workers is not None:
+        return workers
+    from misstep.mixture.fitting import available_cores  # compiled loops: slow to import
+
+    return available_cores()
 
 
 class _Pool(ProcessPoolExecutor):

@@ -84,12 +84,10 @@ def measure_rates(threads: int) -> Rates:
         block = np.linspace(-1.0, 0.0, _BLOCK)
         rounds = 40_000
         work = float(threads * rounds * _BLOCK)
-        return Rates(
-            threads,
-            16.0 * _COPY / _least(lambda: _copy(source, target)),
-            2.0 * _DEGREE * work / _least(lambda: _multiply_add(block, threads, rounds)),
-            work / _least(lambda: _exponentials(block, threads, rounds)),
-        )
+        copying = least_seconds(lambda: _copy(source, target), _REPEATS)
+        adding = least_seconds(lambda: _multiply_add(block, threads, rounds), _REPEATS)
+        raising = least_seconds(lambda: _exponentials(block, threads, rounds), _REPEATS)
+        return Rates(threads, 16.0 * _COPY / copying, 2.0 * _DEGREE * work / adding, work / raising)
     finally:
         numba.set_num_threads(before)
 
@@ -118,10 +116,11 @@ def _processor() -> str:
     return platform.machine()
 
 
-def _least(run: Callable[[], object]) -> float:
+def least_seconds(run: Callable[[], object], repeats: int) -> float:
+    """Return the least time of several, s; a first one, which may compile, does not count."""
     run()
     seconds = math.inf
-    for _ in range(_REPEATS):
+    for _ in range(repeats):
         started = time.perf_counter()
         run()
         seconds = min(seconds, time.perf_counter() - started)

@@ -24,8 +24,14 @@ Workers = Mapping[tuple[Peer, int], Worker]
 """By contender and number of threads."""
 
 _WARM = 2_000
+"""Samples that a fit or a scan is tried on before it is timed."""
+_WARM_QUERIES = 20
 _WITHIN = 0.05
+"""Of a standard deviation, so far apart may modes be that agree."""
 _GROWTH = {"n": 20_000, "k": 5, "d": 5}
+"""Samples, components and columns of a fit, where its cost is not followed along them."""
+_NOT_OFFERED = "not offered"
+"""What a contender answers whose library cannot do it."""
 
 samples_of = lru_cache(maxsize=None)(draw_samples)
 
@@ -122,17 +128,23 @@ class Measuring:
         return Row(task, peer.name, *size, K, threads, iterations=iterations)
 
     def _ask(
-        self, peer: Peer, row: Row, operation: str, arrays: Mapping[str, Array], **settings: float
+        self,
+        peer: Peer,
+        row: Row,
+        operation: str,
+        arrays: Mapping[str, Array],
+        *,
+        warm: int = _WARM,
+        **settings: float,
     ) -> dict[str, Any]:
         worker = self.workers[peer, row.threads or 1]
-        return worker.ask(operation, arrays, self.plan.limit, warm=_WARM, **settings)
+        return worker.ask(operation, arrays, self.plan.limit, warm=warm, **settings)
 
     def _fit(self, peer: Peer, row: Row) -> Row | None:
-        X = samples_of(row.n, row.d, self.seed)
-        arrays = {"X": X, **_named(draw_start(X, row.k or 1, self.seed))}
+        X, components = samples_of(row.n, row.d, self.seed), row.k or 1
+        arrays = {"X": X, **_named(draw_start(X, components, self.seed))}
         settings = {"iterations": row.iterations or 1, "repeats": self.plan.repeats}
         answer = self._ask(peer, row, "fit", arrays, **settings)
-        components = row.k or 1
         return self._timed(row, answer, components, X)
 
     def _scan_from_starts(self, peer: Peer, row: Row) -> Row | None:
@@ -183,21 +195,23 @@ class Measuring:
             "action": first_mode(path.mixture, path.states[0], path.scale),
         }
         settings = {"k": DEFAULT_K, "reach": DEFAULT_REACH}
-        worker = self.workers[peer, row.threads or 1]
-        answer = worker.ask("query", arrays, self.plan.limit, warm=20, **settings)
+        answer = self._ask(peer, row, "query", arrays, warm=_WARM_QUERIES, **settings)
         if "error" in answer:
             return _failed(row, answer)
         modes = np.array(answer["modes"])
         if peer == MISSTEP:
             self._modes[d, K] = modes
-        close = np.abs(modes - self._modes[d, K][:count]) < _WITHIN * path.scale / 0.3
+        agreement = None
+        if (d, K) in self._modes:  # or misstep's own query has failed
+            close = np.abs(modes - self._modes[d, K][:count]) < _WITHIN * path.scale / 0.3
+            agreement = float(np.mean(close.all(axis=1)))
         microseconds = 1e-3 * np.array(answer["nanoseconds"], dtype=float)
         return replace(
             row,
             repeats=count,
             p50_us=float(np.percentile(microseconds, 50)),
             p99_us=float(np.percentile(microseconds, 99)),
-            agreement=float(np.mean(close.all(axis=1))),
+            agreement=agreement,
             bare_seconds=query_work(d, len(path.scale), K).seconds(self.rates[1]),
         )
 
@@ -220,9 +234,6 @@ class Measuring:
             true.append(K)
             seconds += sum(answer.get("seconds", ()))
         return count_right(replace(row, seconds=seconds), chosen, true)
-
-
-_NOT_OFFERED = "not offered"
 
 
 def first_mode(mixture: Mixture, state: Array, scale: Array) -> Array:

@@ -4,11 +4,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from misstep.bench.hardware import least_seconds
 from misstep.bench.results import Row
 from misstep.demonstrators import demonstrate
 from misstep.learners import Evidence, Task
@@ -46,7 +46,7 @@ def measure_trial_and_refit(repeats: int, seed: int) -> list[Row]:
             steps,
             d,
             components,
-            seconds=_least(trial, repeats),
+            seconds=least_seconds(trial, repeats),
             repeats=repeats,
         ),
         Row(
@@ -55,7 +55,7 @@ def measure_trial_and_refit(repeats: int, seed: int) -> list[Row]:
             samples,
             d,
             components,
-            seconds=_least(refit, repeats),
+            seconds=least_seconds(refit, repeats),
             repeats=repeats,
         ),
     ]
@@ -84,13 +84,3 @@ def measure_paper(limit: float) -> list[Row]:
             error = f"ended with {code}" if code else None
             rows.append(Row(task, "misstep", seconds=None if code else seconds, error=error))
     return rows
-
-
-def _least(run: Callable[[], object], repeats: int) -> float:
-    run()
-    seconds = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        run()
-        seconds.append(time.perf_counter() - started)
-    return min(seconds)

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from misstep.errors import MisstepError
-from misstep.runs import make_folder
-from misstep.storage import write_text
+from misstep.storage import make_folder, write_text
 
 PINS = Path(__file__).parent / "peers.txt"
 

@@ -91,20 +91,19 @@ def compare(rows: Iterable[Row]) -> list[Row]:
     """Return the rows with their ratios to others that did the same work, and differences."""
     rows = list(rows)
     at = {(row.contender, *row.same_work): row for row in rows}
-
-    def other(row: Row, contender: str) -> Row:
-        return at.get((contender, *row.same_work), row)
-
     compared = []
     for row in rows:
-        base, least = other(row, "misstep").log_likelihood, row.log_likelihood
+        ours, sklearn, pypr, gmr = (
+            at.get((contender, *row.same_work))
+            for contender in ("misstep", "scikit-learn", "PyPR", "gmr")
+        )
         compared.append(
             replace(
                 row,
-                ratio_to_sklearn=_ratio(row, at.get(("scikit-learn", *row.same_work)), "seconds"),
-                ratio_to_pypr=_ratio(row, at.get(("PyPR", *row.same_work)), "p50_us"),
-                ratio_to_gmr=_ratio(row, at.get(("gmr", *row.same_work)), "p50_us"),
-                log_likelihood_difference=None if base is None or least is None else least - base,
+                ratio_to_sklearn=_ratio(row, sklearn, "seconds"),
+                ratio_to_pypr=_ratio(row, pypr, "p50_us"),
+                ratio_to_gmr=_ratio(row, gmr, "p50_us"),
+                log_likelihood_difference=_difference(row, ours),
             )
         )
     return compared
@@ -113,6 +112,12 @@ def compare(rows: Iterable[Row]) -> list[Row]:
 def _ratio(row: Row, base: Row | None, name: str) -> float | None:
     mine, other = getattr(row, name), getattr(base, name, None)
     return other / mine if mine and other else None
+
+
+def _difference(row: Row, base: Row | None) -> float | None:
+    if base is None or base.log_likelihood is None or row.log_likelihood is None:
+        return None
+    return row.log_likelihood - base.log_likelihood
 
 
 def slopes(rows: Iterable[Row]) -> list[Slope]:

@@ -35,8 +35,7 @@ from misstep.bench.peers import (
 from misstep.bench.plan import FULL, QUICK, Plan
 from misstep.bench.results import Row
 from misstep.bench.worker import Worker
-from misstep.runs import make_folder
-from misstep.storage import write_json, write_text
+from misstep.storage import make_folder, write_json, write_text
 from misstep.version import __version__, command_line
 from misstep.workers import Progress, silent
 

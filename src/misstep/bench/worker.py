@@ -90,16 +90,11 @@ class Worker:
             return {"error": f"longer than {limit:.0f} s"}
         except BrokenPipeError:
             line = ""
-        if not line:
+        if not line.endswith("\n"):  # it may die in the middle of an answer
             self.stop()
             return {"error": "its process died"}
         answer: dict[str, Any] = json.loads(line)
         return answer
-
-    @property
-    def process_id(self) -> int:
-        """The process that takes the next job; it is started if there is none."""
-        return self._running().pid
 
     def stop(self) -> None:
         """End the process, if there is one."""
@@ -134,7 +129,7 @@ class Worker:
 
 
 def _read(stream: IO[str], answers: "queue.Queue[str]") -> None:
-    """Pass lines on, and an empty one at the end."""
+    """Pass lines on, the last one perhaps cut off, and an empty one at the end."""
     try:
         for line in stream:
             answers.put(line)

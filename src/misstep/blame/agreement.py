@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from misstep.learners.donut import SCALE_SHARE
+from misstep.learners.donut import default_scale
 from misstep.learners.mixtures import MixtureParameters
 from misstep.mixture import Conditioner, exploration_from_variance
 from misstep.trajectory import Trajectory
@@ -57,7 +57,7 @@ def find_agreement(
     # A column that is the same everywhere, or says the same as another, tells nothing.
     columns = _independent(states)
     joint = [np.hstack([t.observations[:-1, columns], t.actions]) for t in trajectories]
-    scale = SCALE_SHARE * np.concatenate([t.actions for t in trajectories]).std(axis=0)
+    scale = default_scale(trajectories)
     n = len(columns)
     everybody = _Mixture.fit(joint, None, n, rng)
     folds = min(len(trajectories), MOST_FOLDS)

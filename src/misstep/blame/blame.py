@@ -206,7 +206,7 @@ def _blame(
     if danger is not None and trajectory.failure_step is not None:
         recoverable = np.flatnonzero(danger[: trajectory.failure_step] < 1.0)
         lost = int(recoverable[-1]) if len(recoverable) else -1
-        if lost >= 0 and found.method is PLANS and recovery is not None:
+        if lost >= 0 and found.method == PLANS and recovery is not None:
             fault = find_fault(trajectory, danger, lost, recovery)
     return Blame(
         None if lost is None else max(lost, 0) * trajectory.dt,

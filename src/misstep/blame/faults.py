@@ -67,8 +67,8 @@ def find_fault(
     done = recovery.limits.scaled(trajectory.actions[steps])
     along = (done * wanted).sum(axis=1) / np.maximum(size, 1e-12)
     kinds = np.where(along < -NOTHING, 0, np.where(along < danger[steps], 1, 2))
-    seconds = np.bincount(kinds, minlength=3)
-    kind = int(np.argmax(seconds[:2])) if seconds[:2].sum() else 2
+    counts = np.bincount(kinds, minlength=3)
+    kind = int(np.argmax(counts[:2])) if counts[:2].any() else 2
     first = _start_of_last_run(kinds == kind, max(1, round(INTERRUPTION / trajectory.dt)))
     words = _words(list(FaultKind)[kind], trajectory.action_columns)
     if kind == 1 and len(trajectory.action_columns) == 1:

@@ -43,12 +43,16 @@ def growth_dangers(trajectories: Sequence[Trajectory]) -> list[Array | None]:
     origin = np.mean([states[0] for states in until], axis=0)
     spread = np.concatenate(until).std(axis=0)
     varying = spread > 0
+    if not varying.any():
+        return dangers
     attempts = [
         Scaled((s - origin)[:, varying] / spread[varying], np.zeros((len(s) - 1, 0)), True, 1.0)
         for s in until
     ]
     where = {id(attempt): i for attempt, i in zip(attempts, failed, strict=True)}
     for way in ways_to_fail(attempts, len(attempts)):
+        if not any(attempt.x[-1].any() for attempt in way):
+            continue  # they ended where attempts begin: nothing has grown
         danger = learn_danger(way, trajectories[0].dt)
         if danger.r_squared < LEAST_R_SQUARED:
             continue

@@ -5,12 +5,14 @@ code meaning
 ==== ==============================================================================
 0    the command did what it claims
 1    it ran, and did not: no trial succeeded; or nobody read its output to the end
-2    bad input, or out of memory: one line on stderr says what, where, and what would be right
+2    bad input, or out of memory or disk: one line on stderr says what, where, and what
+     would be right
 130  interrupted with Ctrl-C
 143  terminated with SIGTERM
 ==== ==============================================================================
 """
 
+import errno
 import io
 import os
 import sys
@@ -134,8 +136,7 @@ def _run(words: list[str]) -> int:
     except typer.Exit as exit_:
         return exit_.exit_code
     except BrokenPipeError:
-        # Python flushes stdout once more at its end, and would complain.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return 1
     except (Exception, KeyboardInterrupt) as error:
         told = _explain(error)
@@ -158,6 +159,8 @@ def _explain(error: BaseException) -> tuple[str, int] | None:
         return f"error: {_usage(error)}", 2
     if isinstance(error, MisstepError):
         return f"error: {'' if _has_room() else 'out of memory: '}{error}", 2
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"error: cannot write: {error.strerror}; free some room", 2
     # Libraries that are refused memory raise anything: ImportError, OSError, SystemError ...
     if isinstance(error, MemoryError) or not _has_room():
         return "error: out of memory: free some, or give it less to do at a time", 2
@@ -172,7 +175,16 @@ def _has_room() -> bool:
         return False
 
 
+def _drop_output() -> None:
+    """Let nothing more go to stdout: Python flushes it once more at its end, and would complain."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def _tell(message: str, code: int) -> int:
+    try:
+        sys.stdout.flush()
+    except OSError:  # the message matters more than what cannot be printed
+        _drop_output()
     print("misstep:", " ".join(message.split()), file=sys.stderr)
     return code
 

@@ -194,8 +194,8 @@ def convert(
         only=only,
     )
     target = format_of(out, format_)
-    check_output_file(json, "--json")
-    check_output_file(save_mapping, "--save-mapping")
+    check_output_file(json, "--json", *paths)
+    check_output_file(save_mapping, "--save-mapping", *paths)
     if Path(located(out)).exists() and not force:
         raise MisstepError(f"{out} exists already: choose another name, or add --force")
     if not target.is_folder:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from misstep.cli.options import JsonFile, Seed, parse_names
-from misstep.cli.output import check_output_file, print_table, write_result
+from misstep.cli.output import check_output_file, formatted, print_table, write_result
 from misstep.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -59,8 +59,8 @@ def inspect(
     options = ReadOptions(
         observations=parse_names(observations), actions=parse_names(actions), time=time, rate=rate
     )
-    check_output_file(json, "--json")
-    check_output_file(out, "--out")
+    check_output_file(json, "--json", file)
+    check_output_file(out, "--out", file)
     with progress("looking into attempts") as report:
         inspection = inspect_file(
             file,
@@ -109,8 +109,8 @@ def _print_episodes(inspection: "Inspection") -> None:
             f"{e.duration:.2f}",
             "uneven" if e.rate is None else f"{e.rate:.4g}",
             e.outcome,
-            _number(e.failure_time, ".2f"),
-            _number(point, ".2f"),
+            formatted(e.failure_time, ".2f"),
+            formatted(point, ".2f"),
             e.demonstrator or "-",
             e.recorded or "-",
         )
@@ -138,12 +138,12 @@ def _print_columns(inspection: "Inspection") -> None:
             c.name,
             c.kind,
             c.unit or "-",
-            _number(c.minimum, ".4g"),
-            _number(c.maximum, ".4g"),
-            _number(c.mean, ".4g"),
-            _number(c.deviation, ".4g"),
+            formatted(c.minimum, ".4g"),
+            formatted(c.maximum, ".4g"),
+            formatted(c.mean, ".4g"),
+            formatted(c.deviation, ".4g"),
             str(c.missing),
-            _number(c.at_limit, ".0%"),
+            formatted(c.at_limit, ".0%"),
         )
         for c in inspection.columns
     ]
@@ -161,10 +161,6 @@ def _print_columns(inspection: "Inspection") -> None:
         ),
         rows,
     )
-
-
-def _number(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
 
 
 COMMANDS = [("inspect", inspect, "misstep inspect D.h5 --out PAGE.html")]

@@ -1,6 +1,5 @@
 """``misstep learn`` and ``misstep resume``: trial after trial, until one succeeds."""
 
-import re
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -22,16 +21,13 @@ from misstep.cli.options import (
     recorded_parameters,
     system_parameters,
 )
-from misstep.cli.output import (
-    check_output_file,
-    print_attempts,
-    write_result,
-)
+from misstep.cli.output import check_output_file, print_attempts, write_result
 from misstep.cli.progress import Report, progress
 
 if TYPE_CHECKING:
     from misstep import Run
 
+# The configurations of `misstep.paper.reproduction` and `misstep.study.run`, slow to import.
 _REPRODUCTION, _STUDY = "reproduce.json", "study.json"
 
 
@@ -92,6 +88,7 @@ def learn(
     import misstep
     from misstep.learners import Task, default_learner
     from misstep.runs import CONFIG
+    from misstep.storage import as_file_name
 
     given = system_parameters(set_, success=success, failure=failure, cost=cost)
     parameters = parse_parameters("--with", with_)
@@ -103,9 +100,9 @@ def learn(
         task = Task.of(driven, parse_names(state))
         learner, why = default_learner(task, shown)
         print(f"learner {learner} ({why})")
-    name = re.sub(r"[^\w.-]", "-", f"{system}-{learner}-{seed}")  # gym:space/Robot-v1
+    name = as_file_name(f"{system}-{learner}-{seed}")  # gym:space/Robot-v1
     folder = Path("runs") / name if out is None else out
-    check_output_file(json, "--json")
+    check_output_file(json, "--json", demonstrations)
     with progress("trial") as report, resumable(folder, CONFIG):
         report(0, max_trials, "")
         run = misstep.learn(

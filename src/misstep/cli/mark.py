@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from misstep.cli.options import JsonFile
-from misstep.cli.output import check_output_file, print_table, write_result
+from misstep.cli.output import check_output_file, formatted, print_table, write_result
 from misstep.errors import MisstepError
 from misstep.trajectory import Dataset, Outcome
 
@@ -48,7 +48,7 @@ def mark(
     import misstep
     from misstep.recordings import marking
 
-    check_output_file(json, "--json")
+    check_output_file(json, "--json", file)
     said = (outcome, failure_time, usable)
     if undo:
         if episode is not None or any(value is not None for value in said):
@@ -101,9 +101,11 @@ def _mark(
 
 
 def _outcome(text: str | None) -> Outcome | None:
-    if text is None or text in set(Outcome):
-        return None if text is None else Outcome(text)
-    raise MisstepError(f"the outcome is {text!r}; there are: {', '.join(Outcome)}")
+    if text is None:
+        return None
+    if text not in set(Outcome):
+        raise MisstepError(f"the outcome is {text!r}; there are: {', '.join(Outcome)}")
+    return Outcome(text)
 
 
 def _part(text: str, duration: float) -> tuple[float, float]:
@@ -128,7 +130,7 @@ def _list(dataset: Dataset) -> None:
             str(number),
             f"{t.duration:.2f}",
             str(t.outcome),
-            "-" if t.failure_time is None else f"{t.failure_time:.2f}",
+            formatted(t.failure_time, ".2f"),
             t.provenance.demonstrator or "-",
             "; ".join(t.provenance.notes),
         )

@@ -93,15 +93,27 @@ def parse_parameters(option: str, texts: Sequence[str] | None) -> dict[str, Para
     MisstepError
         If a text is not ``name=value``, or a name comes twice.
     """
-    values: dict[str, ParameterValue] = {}
+    pairs = parse_pairs(option, texts, "length=0.5")
+    return {name: _parse_value(value) for name, value in pairs.items()}
+
+
+def parse_pairs(option: str, texts: Sequence[str] | None, example: str) -> dict[str, str]:
+    """Read the texts of a repeatable option ``name=value``, each value as it was written.
+
+    Raises
+    ------
+    MisstepError
+        If a text is not ``name=value``, or a name comes twice; the message gives the `example`.
+    """
+    pairs: dict[str, str] = {}
     for text in texts or ():
         name, equals, value = (part.strip() for part in text.partition("="))
         if not equals or not name.isidentifier() or not value:
-            raise MisstepError(f"{option} {text!r}: write name=value, such as {option} length=0.5")
-        if name in values:
+            raise MisstepError(f"{option} {text!r}: write name=value, such as {option} {example}")
+        if name in pairs:
             raise MisstepError(f"{option} {text!r}: {name} is given twice")
-        values[name] = _parse_value(value)
-    return values
+        pairs[name] = value
+    return pairs
 
 
 def system_parameters(

@@ -13,18 +13,28 @@ from misstep.version import __version__, command_line
 _WIDTH_OF_A_FILE = 240
 
 
-def check_output_file(path: Path | None, option: str) -> None:
+def check_output_file(path: Path | None, option: str, *inputs: Path) -> None:
     """Make sure that a file can be written, before hours of work are spent on what goes in.
+
+    Parameters
+    ----------
+    path : Path or None
+    option : str
+        What names it on the command line.
+    *inputs : Path
+        What the command reads: a result must not take the place of a recording.
 
     Raises
     ------
     MisstepError
-        If it is a folder, or no file can be made where it should go.
+        If it is a folder or one of the inputs, or no file can be made where it should go.
     """
     if path is None:
         return
     if path.is_dir():
         raise MisstepError(f"{option} {path} is a folder: name a file")
+    if path.exists() and any(other.exists() and path.samefile(other) for other in inputs):
+        raise MisstepError(f"{option} {path} is what is read, and would be lost: name another file")
     try:
         tempfile.TemporaryFile(dir=path.parent).close()
     except OSError as error:
@@ -65,13 +75,14 @@ def print_attempts(name: str, attempts: Sequence[Trajectory]) -> None:
             str(number),
             f"{attempt.duration:.2f}",
             str(attempt.outcome),
-            _number(attempt.failure_time, ".2f"),
-            _number(attempt.mean_cost, ".4g"),
+            formatted(attempt.failure_time, ".2f"),
+            formatted(attempt.mean_cost, ".4g"),
         )
         for number, attempt in enumerate(attempts, start=1)
     ]
     print_table(columns, rows)
 
 
-def _number(value: float | None, form: str) -> str:
+def formatted(value: float | None, form: str) -> str:
+    """Return a number of a table, such as in the form ``".2f"``; a dash where there is none."""
     return "-" if value is None else format(value, form)

@@ -17,11 +17,7 @@ from misstep.cli.options import (
     parse_parameters,
     system_parameters,
 )
-from misstep.cli.output import (
-    check_output_file,
-    print_attempts,
-    write_result,
-)
+from misstep.cli.output import check_output_file, print_attempts, write_result
 from misstep.cli.progress import progress
 from misstep.errors import MisstepError
 from misstep.parameters import build_parameters
@@ -52,7 +48,7 @@ def demonstrate(
     import misstep
 
     given: dict[str, Any] = parse_parameters("--with", with_)
-    kind = build_parameters(misstep.DEMONSTRATORS[by], f"demonstrator {by}", given)
+    demonstrator = build_parameters(misstep.DEMONSTRATORS[by], f"demonstrator {by}", given)
     judged = system_parameters(set_, success=success, failure=failure, cost=cost)
     driven = misstep.make_system(system, **judged)
     _check_out(out, force)
@@ -60,9 +56,9 @@ def demonstrate(
     with progress("demonstrating"):
         dataset = misstep.demonstrate(driven, by, n, seed, **given)
     misstep.save_dataset(dataset, out)
-    demonstrator = asdict(kind)  # type: ignore[call-overload]
+    parameters = asdict(demonstrator)  # type: ignore[call-overload]
     result = {
-        "parameters": {"system": driven.parameters, "demonstrator": demonstrator},
+        "parameters": {"system": driven.parameters, "demonstrator": parameters},
         "system": system,
         "demonstrator": by,
         "seed": seed,

@@ -66,7 +66,7 @@ def resume_reproduction(folder: Path, json: Path | None) -> int:
 
 
 def _conclude(page: Path, json: Path | None) -> int:
-    from misstep.runs import read_json
+    from misstep.storage import read_json
 
     document = read_json(page.parent / "tables.json")
     names = ("parameters", "tables", "claims")

@@ -3,6 +3,7 @@
 import os
 import secrets
 import time
+from contextlib import closing
 from typing import Annotated
 
 import typer
@@ -58,19 +59,15 @@ def offer(
 
     simulation = misstep.make_system(system, **parse_parameters("--set", set_))
     token = os.environ.get(TOKEN) or secrets.token_urlsafe(16)
-    hub = SystemHub(simulation, token, watchdog=watchdog_ms / 1e3)
-    try:
-        server = SocketServer(hub, socket)
-        try:
-            if not os.environ.get(TOKEN):
-                print(f"token {token}")
-            print(f"listening at {server.address}", flush=True)
-            while True:
-                time.sleep(1.0)
-        finally:
-            server.close()
-    finally:
-        hub.close()
+    with (
+        closing(SystemHub(simulation, token, watchdog=watchdog_ms / 1e3)) as hub,
+        closing(SocketServer(hub, socket)) as server,
+    ):
+        if not os.environ.get(TOKEN):
+            print(f"token {token}")
+        print(f"listening at {server.address}", flush=True)
+        while True:
+            time.sleep(1.0)
 
 
 COMMANDS = [

@@ -1,9 +1,9 @@
 """``misstep ros1`` and ``misstep ros2``: the nodes of ROS 1 and of ROS 2."""
 
 import math
-import signal
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,11 +21,13 @@ from misstep.cli.options import (
     SystemName,
     SystemParameters,
     parse_names,
+    parse_pairs,
     parse_parameters,
     system_parameters,
 )
 from misstep.cli.output import check_output_file, print_attempts, write_result
 from misstep.errors import MisstepError
+from misstep.parameters import build_parameters
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -84,22 +86,17 @@ def simulate(
     from misstep.robot.ros.simulation_node import SimulationNode
     from misstep.robot.ros.topics import Topics
 
-    _end_by_signals()
     plant = Plant(system, parse_parameters("--set", set_), rate)
-    bus = _open_bus(context, "simulation")
-    node = SimulationNode(
-        bus,
-        plant,
-        Topics(joint_states, _topics(command, plant.system)),
-        Joints(plant.system.observation_columns, _joint_names(joint)),
-        lock_step=lock_step,
-        watchdog=watchdog_ms / 1e3,
-    )
-    try:
-        node.run()
-    finally:
-        print(f"{node.steps} steps, {node.late} of them late", flush=True)
-        bus.close()
+    topics = Topics(joint_states, _topics(command, plant.system))
+    joints = Joints(plant.system.observation_columns, _joint_names(joint))
+    with closing(_open_bus(context, "simulation")) as bus:
+        node = SimulationNode(
+            bus, plant, topics, joints, lock_step=lock_step, watchdog=watchdog_ms / 1e3
+        )
+        try:
+            node.run()
+        finally:
+            print(f"{node.steps} steps, {node.late} of them late", flush=True)
 
 
 def control(
@@ -158,38 +155,35 @@ def control(
     check_output_file(out, "--out")
     if by is not None and out is None:
         raise MisstepError("--by demonstrates: give --out, the file for the demonstrations")
-    _end_by_signals()
+    given = parse_parameters("--with", with_)
+    if by is not None:
+        _check_demonstrator(by, given)
     described = _make_system(system, set_, success, failure, cost)
+    topics = Topics(joint_states, _topics(command, described))
     joints = Joints(described.observation_columns, _joint_names(joint))
     predicate = _ready(ready, described)
-    bus = _open_bus(context, "controller")
-    recorder = None if bags is None else _open_recorder(context, bags)
-    robot = TopicRobot(
-        bus,
-        Topics(joint_states, _topics(command, described)),
-        joints,
-        lock_step=lock_step,
-        ready=predicate,
-        recorder=recorder,
-    )
-    driven = JointSystem(
-        described, robot, patience=_SILENCE_IN_LOCK_STEP if lock_step else _SILENCE
-    )
+    silence = _SILENCE_IN_LOCK_STEP if lock_step else _SILENCE
     result: dict[str, Any] = {"demonstrations": 0, "trials": 0}
-    try:
+    with ExitStack() as stack:
+        bus = stack.enter_context(closing(_open_bus(context, "controller")))
+        recorder = None if bags is None else _open_recorder(context, bags)
+        robot = stack.enter_context(
+            closing(
+                TopicRobot(
+                    bus, topics, joints, lock_step=lock_step, ready=predicate, recorder=recorder
+                )
+            )
+        )
+        driven = stack.enter_context(closing(JointSystem(described, robot, patience=silence)))
         robot.wait(patience)
         if by is not None and out is not None:
-            shown = _demonstrate(driven, by, n, seed, parse_parameters("--with", with_))
+            shown = _demonstrate(driven, by, n, seed, given)
             save_dataset(shown, out)
-            print_attempts("demonstration", list(shown))
+            print_attempts("demonstration", shown)
             result["demonstrations"] = len(shown)
         if explore:
             explorer = NodeExplorer(bus, node, patience)
             result["trials"] = explore_on(explorer, driven)
-    finally:
-        driven.close()
-        robot.close()
-        bus.close()
     write_result(json, result)
 
 
@@ -240,42 +234,40 @@ def explore(
     from misstep.runs import load_run
 
     check_output_file(json, "--json")
-    _end_by_signals()
     safety = Safety(watchdog_ms / 1e3, 0.0, dry_run)
-    bus = _open_bus(context, "exploration")
-    if demonstrations is None:
-        run = load_run(folder)
-        described = run.config.make_system()
-    else:
-        described = _make_system(system, set_, success, failure, cost)
-        run = _begin(
-            folder,
-            _wait_for(demonstrations, patience),
-            described,
-            learner,
-            state=parse_names(state),
-            max_trials=max_trials,
-            seed=seed,
-            stop_on_success=not keep_going,
-            **parse_parameters("--with", with_),
+    given = parse_parameters("--with", with_)
+    with ExitStack() as stack:
+        bus = stack.enter_context(closing(_open_bus(context, "exploration")))
+        if demonstrations is None:
+            run = load_run(folder)
+            described = run.config.make_system()
+        else:
+            described = _make_system(system, set_, success, failure, cost)
+            run = _begin(
+                folder,
+                _wait_for(demonstrations, patience),
+                described,
+                learner,
+                state=parse_names(state),
+                max_trials=max_trials,
+                seed=seed,
+                stop_on_success=not keep_going,
+                **given,
+            )
+        service = ExplorationService(
+            run,
+            system=described,
+            limits=Limits.of(described, rate=rate_limit, jerk=jerk_limit),
+            safety=safety,
+            simulated_time=lock_step,
+            on_trial=_print_trial,
         )
-    service = ExplorationService(
-        run,
-        system=described,
-        limits=Limits.of(described, rate=rate_limit, jerk=jerk_limit),
-        safety=safety,
-        simulated_time=lock_step,
-        on_trial=_print_trial,
-    )
-    node = ExplorationNode(bus, service, _topics(command, described), lock_step=lock_step)
-    try:
+        stack.enter_context(closing(service))
+        topics = _topics(command, described)
+        node = ExplorationNode(bus, service, topics, lock_step=lock_step)
+        stack.enter_context(closing(node))
         node.wait()
-    finally:
-        node.close()
-        service.close()
-        bus.close()
-    status = service.status()
-    write_result(json, {"run": str(run.folder), **status})
+    write_result(json, {"run": str(run.folder), **service.status()})
     return 0 if run.succeeded or not run.config.stop_on_success else 1
 
 
@@ -302,11 +294,6 @@ def _is_ros1(context: typer.Context) -> bool:
     return context.parent is None or context.parent.info_name == "ros1"
 
 
-def _end_by_signals() -> None:
-    """Let SIGTERM, which roslaunch sends, end a node as Ctrl-C does: in order."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-
-
 def _make_system(name: str, set_: Sequence[str] | None, *judges: str | None) -> "System":
     from misstep.systems import make_system
 
@@ -325,7 +312,7 @@ def _topics(text: str, system: "System") -> tuple[str, ...]:
 
 
 def _joint_names(texts: Sequence[str] | None) -> Mapping[str, str]:
-    return {name: str(joint) for name, joint in parse_parameters("--joint", texts).items()}
+    return parse_pairs("--joint", texts, "theta=hinge")
 
 
 def _ready(text: str | None, system: "System") -> "Callable[[Row], bool] | None":
@@ -337,6 +324,16 @@ def _ready(text: str | None, system: "System") -> "Callable[[Row], bool] | None"
 
     formula = parse_predicate(text, system.observation_columns, "--ready")
     return lambda observation: bool(formula(np.array(observation)))
+
+
+def _check_demonstrator(by: str, parameters: Mapping[str, Any]) -> None:
+    """Raise MisstepError for an unknown demonstrator or parameter, before a robot is waited for."""
+    from misstep.demonstrators import DEMONSTRATORS
+
+    if by != _KEYBOARD:
+        build_parameters(DEMONSTRATORS[by], f"demonstrator {by}", parameters)
+    elif parameters:
+        raise MisstepError("--with is for demonstrators that are simulated, not for the keyboard")
 
 
 def _demonstrate(

@@ -1,7 +1,7 @@
 """Ways to fail at balancing: the pole falls, for each kind in a way of its own.
 
 Every kind is a frozen dataclass of parameters whose `policy` drives a system that observes an
-angle ``theta`` [rad] and takes one force [N].
+angle ``theta`` [rad] and takes one force [N]; `Random` drives any system.
 """
 
 from collections import deque
@@ -15,6 +15,7 @@ from misstep.demonstrators.recording import DEMONSTRATORS
 from misstep.errors import MisstepError
 from misstep.parameters import check_parameters, parameter
 from misstep.rollout import Policy
+from misstep.systems.simulated import LONGEST_TIME
 from misstep.systems.system import System
 
 
@@ -36,8 +37,10 @@ class _Proportional(_Balancing):
 
     gain: float = parameter(20.0, "N/rad", "force per angle of the pole")
     noise: float = parameter(5.0, "N", "standard deviation of the noise on the force", at_least=0)
-    hold: float = parameter(0.1, "s", "for how long one draw of the noise is held", above=0)
-    delay: float = parameter(0.0, "s", "how late the angle is seen", at_least=0)
+    hold: float = parameter(
+        0.1, "s", "for how long one draw of the noise is held", above=0, at_most=LONGEST_TIME
+    )
+    delay: float = parameter(0.0, "s", "how late the angle is seen", at_least=0, at_most=60)
 
     def __post_init__(self) -> None:
         check_parameters(self, f"demonstrator {type(self).__name__.lower()}")
@@ -66,7 +69,7 @@ class Weak(_Proportional):
 class Delayed(_Proportional):
     """Pushes hard enough, and too late."""
 
-    delay: float = parameter(0.1, "s", "how late the angle is seen", at_least=0)
+    delay: float = parameter(0.1, "s", "how late the angle is seen", at_least=0, at_most=60)
 
 
 @DEMONSTRATORS.register("reversed")
@@ -82,7 +85,9 @@ class Reversed(_Proportional):
 class Random:
     """Acts at random, over everything that the actuators can do, on any system."""
 
-    hold: float = parameter(0.1, "s", "for how long one draw of the action is held", above=0)
+    hold: float = parameter(
+        0.1, "s", "for how long one draw of the action is held", above=0, at_most=LONGEST_TIME
+    )
 
     def __post_init__(self) -> None:
         check_parameters(self, "demonstrator random")
@@ -108,7 +113,7 @@ class BangBang(_Balancing):
     force: float = parameter(10.0, "N", "force of a key", above=0)
     dead_zone_deg: float = parameter(1.0, "deg", "angle below which no key is pressed", at_least=0)
     reaction_min: float = parameter(0.2, "s", "shortest reaction time", at_least=0)
-    reaction_max: float = parameter(0.3, "s", "longest reaction time", at_least=0)
+    reaction_max: float = parameter(0.3, "s", "longest reaction time", at_least=0, at_most=60)
 
     def __post_init__(self) -> None:
         check_parameters(self, "demonstrator bang-bang")

@@ -10,7 +10,7 @@ it is multiplied out beforehand, and the centres are padded to whole vector regi
 
 Fast-math is limited to re-ordering. What uses it is inlined by force, up to the functions that only
 Python calls: left to itself, the process that compiles and later ones that load from the cache run
-copies whose last bits differ (as in `misstep.mixture.compiled`).
+copies whose last bits differ (as in `misstep.mixture.em`).
 """
 
 import math
@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from misstep.costs import EFFORT, FREE_SHARE, WALL, StateCost
 from misstep.errors import MisstepError
-from misstep.mixture.compiled import REORDER
-from misstep.mixture.elementary import exp_nonpositive
+from misstep.mixture.elementary import REORDER, exp_nonpositive
 
 Array = NDArray[np.float64]
 

@@ -271,8 +271,8 @@ def robust_deviation(residuals: Array) -> Array:
     return deviation
 
 
-def student_weights(residuals: Array, deviation: Array) -> Array:
-    """Return the expected precision of residuals (N, ny) under Student's t, 1 at a typical one."""
+def student_weights(residuals: Array, deviation: Array | float) -> Array:
+    """Return the expected precision of residuals (N, …) under Student's t, 1 at a typical one."""
     weights: Array = (STUDENT + 1.0) / (STUDENT + (residuals / deviation) ** 2)
     return weights
 
@@ -284,7 +284,7 @@ def outlier_weights(residuals: Array) -> Array:
     others to be as small as that.
     """
     limit = np.maximum(OUTLIER_DEVIATIONS * robust_deviation(residuals), OUTLIER_SPREAD)
-    far = student_weights(residuals, np.full(residuals.shape[1], NOISE_FLOOR))
+    far = student_weights(residuals, NOISE_FLOOR)
     return np.where(np.abs(residuals) > limit, far, 1.0)
 
 
@@ -309,7 +309,7 @@ def _integral(value: Array, change: Array, wanted: Array) -> tuple[float, float,
         root = np.sqrt(weights)
         solution = np.linalg.lstsq(x * root[:, None], wanted * root, rcond=None)[0]
         errors = wanted - x @ solution
-        weights = (STUDENT + 1.0) / (STUDENT + (errors / tolerance) ** 2)
+        weights = student_weights(errors, tolerance)
     if (np.abs(errors) < 3.0 * tolerance).mean() < KINEMATIC_SHARE:
         return np.inf, 0.0, 0.0
     residual = np.sqrt((weights * errors**2).sum() / weights.sum()) / spread

@@ -118,6 +118,8 @@ def append_trajectory(path: str | os.PathLike[str], trajectory: Trajectory) -> N
 
     Killed at any instant, it leaves the file as it was or with the trajectory added. Two
     processes must not append to one file at the same time: one of the additions would be lost.
+    Formats other than misstep's own are written anew, with what misstep reads of them: videos or
+    topics that another program wrote beside it are not kept.
 
     Raises
     ------
@@ -125,7 +127,7 @@ def append_trajectory(path: str | os.PathLike[str], trajectory: Trajectory) -> N
         If no format goes by the suffix, the file cannot be read or written, or its trajectories
         have other columns or another dt.
     """
-    if not os.path.lexists(path):
+    if not os.path.lexists(minari.located(path)):
         write_episodes(path, [Episode.of(trajectory)])
         return
     target = format_to_read(path)
@@ -256,7 +258,7 @@ def format_to_read(path: str | os.PathLike[str], name: str | None = None) -> For
     for candidate in (*own, *others):
         if path.exists() and candidate.recognise(path):
             return candidate
-    if is_folder and path.suffix.lower() not in {s for f in _formats() for s in f.suffixes}:
+    if is_folder and suffix not in {s for f in _formats() for s in f.suffixes}:
         folders = ", ".join(name for name, entry in FORMATS.items() if entry.is_folder) or "none"
         raise MisstepError(
             f"{path}: the folder is of no known format; formats that are folders: {folders}"

@@ -76,12 +76,12 @@ def read_annotation(text: str) -> Annotation:
         raise MisstepError(f"misstep's annotation has {len(text)} characters: that is too long")
     try:
         said = json.loads(text)
-        if said["misstep"] > _VERSION:
-            raise MisstepError("misstep's annotation is of a newer misstep: install that")
-        return _annotation(said)
+        is_newer = said["misstep"] > _VERSION
+        if not is_newer:
+            return _annotation(said)
     except (ArithmeticError, KeyError, TypeError, ValueError, RecursionError) as error:
-        reason = reason_of(error)
-        raise MisstepError(f"misstep's annotation is damaged ({reason})") from error
+        raise MisstepError(f"misstep's annotation is damaged ({reason_of(error)})") from error
+    raise MisstepError("misstep's annotation is of a newer misstep: install that")
 
 
 def _annotation(said: dict[str, Any]) -> Annotation:

@@ -21,7 +21,7 @@ def aligned(blocks: Iterable[Block], *, has_actions: bool) -> Iterator[Block]:
     kept: Block | None = None
     for block in blocks:
         whole = block if kept is None else followed(kept, block)
-        count = len(whole.observations) - 1
+        count = max(0, len(whole.observations) - 1)
         if has_actions:
             count = min(count, len(whole.actions))
         if whole.costs is not None:

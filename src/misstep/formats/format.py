@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
+from misstep.parameters import LARGEST
 from misstep.trajectory import Column, Outcome, Provenance, Trajectory
 
 FloatArray = NDArray[np.float64]
@@ -232,6 +233,11 @@ class ReadOptions:
         Hand on NaN where there is no number, rather than refuse it: for who wants to report gaps.
     report : callable or None
         ``report(done, total)``, to be called now and then, in bytes or in any other count.
+
+    Raises
+    ------
+    MisstepError
+        If the rate is not positive and finite.
     """
 
     observations: tuple[str, ...] | None = None
@@ -244,6 +250,10 @@ class ReadOptions:
     only: str | None = None
     keep_nan: bool = False
     report: Callable[[int, int], None] | None = None
+
+    def __post_init__(self) -> None:
+        if self.rate is not None and not 0 < self.rate <= LARGEST:
+            raise MisstepError(f"the rate is {self.rate}: it has to be positive, in Hz")
 
 
 Read = Callable[[Path, ReadOptions], Iterator[Episode]]

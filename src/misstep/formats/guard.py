@@ -41,7 +41,8 @@ def guarded(path: Path, episodes: Iterator[Episode], *, keep_nan: bool) -> Itera
     ------
     MisstepError
         What the reader raises; and if blocks do not fit their header, an episode does not hold
-        T + 1 observations of T >= 1 actions, times do not increase, or a value is not finite.
+        T + 1 observations of T >= 1 actions, times do not increase, a value is not finite, or the
+        failure step is none of its observations.
     """
     with prefixed(f"cannot read {path}"):
         for index, episode in enumerate(episodes):
@@ -50,9 +51,9 @@ def guarded(path: Path, episodes: Iterator[Episode], *, keep_nan: bool) -> Itera
 
 def _guard(path: Path, index: int, episode: Episode, keep_nan: bool) -> Episode:
     words = f"cannot read {path}: episode_{index}"
+    check = _Check(episode, keep_nan)
 
     def blocks() -> Iterator[Block]:
-        check = _Check(episode, keep_nan)
         with prefixed(words):
             for block in episode.blocks:
                 check.block(block)
@@ -61,7 +62,9 @@ def _guard(path: Path, index: int, episode: Episode, keep_nan: bool) -> Episode:
 
     def ending() -> Ending:
         with prefixed(words):
-            return episode.ending()
+            ended = episode.ending()
+            check.ending(ended)
+            return ended
 
     return replace(episode, blocks=blocks(), ending=ending)
 
@@ -115,9 +118,16 @@ class _Check:
             raise MisstepError("rows carry times exactly where there is no common dt")
         if block.times is None or len(block.times) == 0:
             return
+        unknown = np.flatnonzero(~np.isfinite(block.times))
+        if len(unknown):
+            row = int(unknown[0])
+            raise MisstepError(
+                f"{self._where(self._rows + row)}: the time is {block.times[row]} s: every time "
+                "has to be finite"
+            )
         steps = np.diff(block.times, prepend=self._last_time)
-        if not (steps > 0).all():  # NaN too
-            row = int(np.flatnonzero(~(steps > 0))[0])
+        if not (steps > 0).all():
+            row = int(np.flatnonzero(steps <= 0)[0])
             before = block.times[row - 1] if row else self._last_time
             raise MisstepError(
                 f"{self._where(self._rows + row)}: time {block.times[row]} s comes after {before} "
@@ -138,6 +148,14 @@ class _Check:
                     f"it has {self._rows} observations but {count} {name}: an episode of T "
                     f"{name} holds T + 1 observations"
                 )
+
+    def ending(self, ending: Ending) -> None:
+        step = ending.failure_step
+        if step is not None and not 0 <= step < self._rows:
+            raise MisstepError(
+                f"failure_step is {step}, but there are {self._rows} observations, from 0: were "
+                "rows taken out after it was written?"
+            )
 
 
 def check_same_kind(index: int, header: Header, first: Header) -> None:

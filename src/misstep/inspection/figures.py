@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from misstep.blame import Blame
 from misstep.plots import DATA, FAINT, INK, MODEL, PAPER, SERIES, style
 from misstep.trajectory import Column, Trajectory
+from misstep.units import TURNS
 
 Array = NDArray[np.float64]
 
@@ -51,7 +52,6 @@ def _panels(columns: Sequence[Column], values: Array) -> list[tuple[list[Column]
 def _draw_signals(ax: Axes, times: Array, columns: Sequence[Column], values: Array) -> None:
     named = len(columns) <= _MOST_NAMED
     for i, column in enumerate(columns):
-        shown = _without_jumps(values[:, i], column)
         colour = SERIES[i % len(SERIES)] if len(columns) > 1 else INK
         label = column.name if named and len(columns) > 1 else None
         if len(values) < len(times):  # an action is held until the next
@@ -64,6 +64,7 @@ def _draw_signals(ax: Axes, times: Array, columns: Sequence[Column], values: Arr
                 label=label,
             )
         else:
+            shown = _without_jumps(values[:, i], column)
             ax.plot(times, shown, color=colour, lw=1.3, label=label)
     name = columns[0].name if len(columns) == 1 else f"{len(columns)} columns"
     ax.set_ylabel(f"{name}\n[{columns[0].unit}]" if columns[0].unit else name)
@@ -73,7 +74,7 @@ def _draw_signals(ax: Axes, times: Array, columns: Sequence[Column], values: Arr
 
 def _without_jumps(values: Array, column: Column) -> Array:
     """Return values (T,) with NaN where an angle goes on at the other end of its turn."""
-    turn = {"rad": 2.0 * np.pi, "deg": 360.0}.get(column.unit)
+    turn = TURNS.get(column.unit)
     if turn is None:
         return values
     shown = values.copy()

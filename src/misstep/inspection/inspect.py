@@ -14,7 +14,7 @@ import numpy as np
 from misstep.blame import ActionLimits, Blame, action_limits, find_blame, sentences
 from misstep.errors import MisstepError
 from misstep.formats import Episode, Header, ReadOptions, read_episodes
-from misstep.formats.format import joined
+from misstep.formats.format import LARGEST_IN_MEMORY, joined
 from misstep.inspection.summary import ColumnSummary, EpisodeSummary, Tally, fingerprint
 from misstep.recordings.checking import Checked, check_recorded
 from misstep.trajectory import Dataset, Trajectory
@@ -135,6 +135,7 @@ class _Collected:
         self.episodes: list[EpisodeSummary] = []
         self._first: Header | None = None
         self._trajectories: list[Trajectory] = []
+        self._n_bytes = 0
         self._reason = ""
         self._seen: dict[bytes, int] = {}
 
@@ -160,10 +161,15 @@ class _Collected:
         if self._reason:
             return
         whole = Episode(header, iter([block]), lambda: ending)
+        self._n_bytes += block.observations.nbytes + block.actions.nbytes
         try:
             self._trajectories.append(whole.trajectory())
         except MisstepError as error:
             self._reason = f"episode {number}: {error}"
+        if self._n_bytes > LARGEST_IN_MEMORY:
+            self._reason = f"it takes up more than {LARGEST_IN_MEMORY} bytes in memory"
+        if self._reason:
+            self._trajectories.clear()  # nobody wants them any more
 
     def dataset(self) -> tuple[Dataset | None, ActionLimits | None, str]:
         """Return the trajectories and the limits of their actions, or why there are none."""

@@ -1,6 +1,7 @@
 """The page of an inspection: one self-contained HTML file."""
 
 import base64
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,7 +28,6 @@ class _Attempt(NamedTuple):
     found: bool
     signals: Markup
     film: Markup | None
-    no_film_because: str
 
 
 def render_inspection(inspection: Inspection, progress: Progress = lambda done, total: None) -> str:
@@ -71,11 +71,10 @@ def _attempt(inspection: Inspection, index: int) -> _Attempt:
     if inspection.dataset is None:
         raise ValueError("without a data set there are no attempts")
     trajectory, blame = inspection.dataset[index], inspection.blames[index]
-    film, reason = None, ""
     try:
         film = _picture(draw_filmstrip(trajectory, blame))
-    except MisstepError as error:
-        reason = str(error)
+    except MisstepError:  # nobody can draw the system
+        film = None
     return _Attempt(
         index + 1,
         blame.sentence,
@@ -84,7 +83,6 @@ def _attempt(inspection: Inspection, index: int) -> _Attempt:
         blame.danger is not None,
         _picture(draw_blame(trajectory, blame)),
         film,
-        reason,
     )
 
 
@@ -93,5 +91,6 @@ def _picture(png: bytes) -> Markup:
     return Markup(f"data:image/png;base64,{content}")  # noqa: S704 - base64 is inert
 
 
-def _distinct(texts: object) -> list[str]:
-    return list(dict.fromkeys(t for t in texts if t))  # type: ignore[attr-defined]
+def _distinct(texts: Iterable[str]) -> list[str]:
+    """Return the texts that are not empty, each once."""
+    return list(dict.fromkeys(text for text in texts if text))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from misstep.formats import Block, Ending, Header
 from misstep.trajectory import Column
+from misstep.units import TURNS
 
 Array = NDArray[np.float64]
 
@@ -62,7 +63,7 @@ class EpisodeSummary:
     notes : tuple of str
         What was inferred or changed.
     missing : int
-        Values that are no numbers.
+        Values that are no finite numbers.
     gaps : tuple of Gap
     jumps : tuple of Jump
     repeated : int
@@ -98,7 +99,7 @@ class EpisodeSummary:
         """Summarise an episode, its blocks joined."""
         times = times_of(header, block)
         source, failed = header.provenance, ending.failure_step
-        repeated = (np.diff(block.observations, axis=0) == 0).all(axis=1)
+        repeated = (block.observations[1:] == block.observations[:-1]).all(axis=1)
         intervals = np.diff(times)
         return cls(
             number=number,
@@ -112,7 +113,7 @@ class EpisodeSummary:
             recorded=source.time,
             seed=source.seed,
             notes=(*source.notes, *ending.notes),
-            missing=int(np.isnan(block.observations).sum() + np.isnan(block.actions).sum()),
+            missing=sum(int((~np.isfinite(t)).sum()) for t in (block.observations, block.actions)),
             gaps=_gaps(times),
             jumps=_jumps(times, block.observations, header.observation_columns),
             repeated=int(repeated.sum()),
@@ -160,7 +161,7 @@ class ColumnSummary:
     minimum, maximum, mean, deviation : float or None
         In the column's unit; None where every value is missing.
     missing : int
-        Values that are no numbers.
+        Values that are no finite numbers.
     at_limit : float or None
         Of an action, the share of steps at the smallest or largest value: those of the actuator
         where they are known, else those that were seen. None of an observation.
@@ -277,17 +278,19 @@ def _gaps(times: Array) -> tuple[Gap, ...]:
 def _jumps(times: Array, observations: Array, columns: Sequence[Column]) -> tuple[Jump, ...]:
     if len(observations) <= 2 * _AROUND + 1:
         return ()
-    changes = np.diff(observations, axis=0)
-    angles = np.array([column.unit == "rad" for column in columns])
-    changes[:, angles] = (changes[:, angles] + np.pi) % (2.0 * np.pi) - np.pi
+    known = np.where(np.isfinite(observations), observations, np.nan)
+    changes = np.diff(known, axis=0)
+    turns = np.array([TURNS.get(column.unit, np.inf) for column in columns])
+    angles = np.isfinite(turns)
+    half = 0.5 * turns[angles]
+    changes[:, angles] = (changes[:, angles] + half) % turns[angles] - half
     size = np.nan_to_num(np.abs(changes))
     padded = np.pad(size, ((_AROUND, _AROUND), (0, 0)), mode="reflect")
     around = np.median(
         np.lib.stride_tricks.sliding_window_view(padded, 2 * _AROUND + 1, axis=0), axis=-1
     )
-    known = np.where(np.isfinite(observations), observations, np.nan)
     reach = np.array([np.ptp(c[np.isfinite(c)]) if np.isfinite(c).any() else 0.0 for c in known.T])
-    reach[angles] = np.minimum(reach[angles], 2.0 * np.pi)
+    reach = np.minimum(reach, turns)
     found = (size > JUMP * around) & (size > JUMP_SHARE * reach)
     # Something that stands still for a while and then moves on does not jump.
     found &= around > 0

@@ -35,8 +35,7 @@ from misstep.trajectory import Outcome, Trajectory
 
 Array = NDArray[np.float64]
 
-# How far demonstrated actions spread, times this, is the disagreement that counts as half.
-SCALE_SHARE = 0.3
+_SCALE_SHARE = 0.3
 # s beside which any disagreement is none.
 NO_EXPLORATION = 1e9
 CLIMBS = ("warm", "density", "global")
@@ -77,6 +76,8 @@ class DonutParameters(MixtureParameters):
     def restore(task: Task, arrays: Mapping[str, Array]) -> "DonutPolicy":
         """Return the policy that `DonutPolicy.arrays` described."""
         k, reach, climb, formula = arrays["settings"].tolist()
+        if climb not in range(len(CLIMBS)) or formula not in range(len(FORMULAS)):
+            raise MisstepError(f"a donut policy has no climb {climb:g} or no formula {formula:g}")
         settings = DonutSettings(k, reach, CLIMBS[int(climb)], FORMULAS[int(formula)])
         return DonutPolicy(task, restore_mixture(arrays), arrays["scale"], settings)
 
@@ -84,13 +85,16 @@ class DonutParameters(MixtureParameters):
         self, task: Task, mixture: GaussianMixture, demonstrations: Sequence[Trajectory]
     ) -> "DonutPolicy":
         """Return the policy that explores away from `mixture`."""
-        m = len(task.action_columns)
-        scale = np.full(m, self.scale)
+        scale = np.full(len(task.action_columns), self.scale)
         if self.scale == 0.0:
-            shown = np.concatenate([t.actions for t in demonstrations])
-            scale = SCALE_SHARE * shown.std(axis=0)
+            scale = default_scale(demonstrations)
         settings = DonutSettings(self.k, self.reach, self.climb, self.formula)
         return DonutPolicy(task, mixture, scale, settings)
+
+
+def default_scale(attempts: Sequence[Trajectory]) -> Array:
+    """Return the s that nobody chose, shape (m,): 0.3 × the standard deviation of each action."""
+    return _SCALE_SHARE * np.concatenate([t.actions for t in attempts]).std(axis=0)
 
 
 class DonutSettings(NamedTuple):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from misstep.errors import MisstepError
 from misstep.learners.donut import DonutParameters, DonutPolicy
 from misstep.learners.learner import LEARNERS, Evidence, Task, joint_samples
+from misstep.learners.mixtures import check_choice
 from misstep.mixture import GaussianMixture
 from misstep.parameters import parameter
 from misstep.trajectory import Trajectory
@@ -36,10 +37,7 @@ class DonutCostLearner(DonutParameters):
 
     def __post_init__(self) -> None:
         self.check("learner donut-cost")
-        if self.method not in METHODS:
-            raise MisstepError(
-                f"learner donut-cost: method is {self.method!r}; there are: {', '.join(METHODS)}"
-            )
+        check_choice("learner donut-cost", "method", self.method, METHODS)
 
     def policy(self, task: Task, evidence: Evidence, rng: np.random.Generator) -> DonutPolicy:
         """Return the donut policy on the cost-weighted attempts."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from misstep.errors import MisstepError
-from misstep.learners.donut import SCALE_SHARE
+from misstep.learners.donut import default_scale
 from misstep.learners.learner import LEARNERS, Evidence, Task, joint_samples
 from misstep.learners.mixtures import (
     MixtureParameters,
@@ -24,6 +24,7 @@ from misstep.learners.mixtures import (
     restore_mixture,
 )
 from misstep.mixture import Conditioner, DonutMixture, GaussianMixture, exploration_from_variance
+from misstep.mixture.donut_mixture import check_scale
 from misstep.parameters import check_parameters, parameter
 from misstep.trajectory import Trajectory
 
@@ -44,15 +45,26 @@ class IncrementalPolicy(MixturePolicy):
         On the columns (state, merit).
     scale : ndarray, shape (m,)
         s of the exploration formula, in the action's unit.
+
+    Raises
+    ------
+    MisstepError
+        If a mixture has other columns than the task, or s is out of its range.
     """
 
     def __init__(
         self, task: Task, mixture: GaussianMixture, merit: GaussianMixture, scale: Array
     ) -> None:
         super().__init__(task, mixture)
+        check_scale(scale, len(task.action_columns))
         self.merit = merit
         self.scale = scale
-        self._merit = Conditioner(merit, range(len(task.state)))
+        n, columns = len(task.state), merit.means_.shape[1]
+        if columns != n + 1:
+            raise MisstepError(
+                f"the policy's merit has {columns} columns, but the task has {n} of state"
+            )
+        self._merit = Conditioner(merit, range(n))
         self.reset()
 
     def reset(self) -> None:
@@ -80,7 +92,9 @@ class IncrementalPolicy(MixturePolicy):
 class DonutIncremental(MixtureParameters):
     """Rung 3: the donut, keeping what was followed by little cost and exploring the rest."""
 
-    outlook: float = parameter(0.5, "s", "how far ahead the cost of a step is counted", above=0)
+    outlook: float = parameter(
+        0.5, "s", "how far ahead the cost of a step is counted", above=0, at_most=3600
+    )
 
     rung: ClassVar[int] = 3
 
@@ -91,13 +105,17 @@ class DonutIncremental(MixtureParameters):
         """Return the policy that explores where nothing good is known."""
         samples = joint_samples(task, evidence.attempts)
         merit = merits(evidence.attempts, max(1, round(self.outlook / task.dt)))
+        if np.ptp(merit) == 0.0:
+            raise MisstepError(
+                "all steps of all attempts cost the same: donut-incremental needs costs that tell "
+                "good steps from bad ones"
+            )
         states = samples[:, : len(task.state)]
-        shown = np.concatenate([t.actions for t in evidence.demonstrations])
         return IncrementalPolicy(
             task,
             self.fit(samples, rng, np.maximum(merit, LEAST_WEIGHT)),
             self.fit(np.column_stack([states, merit]), rng),
-            SCALE_SHARE * shown.std(axis=0),
+            default_scale(evidence.demonstrations),
         )
 
     @staticmethod
@@ -110,7 +128,8 @@ class DonutIncremental(MixtureParameters):
 def merits(attempts: Sequence[Trajectory], outlook: int) -> Array:
     """Return each step's rank by the mean cost of the next `outlook` steps, 1 the best, shape (N,).
 
-    Past the end of a failed attempt every step costs as much as the worst that was seen.
+    Past the end of a failed attempt every step costs as much as the worst that was seen, past the
+    end of another as much as its last.
 
     Raises
     ------

@@ -94,7 +94,7 @@ class DynamicsPolicy:
     Raises
     ------
     MisstepError
-        If the horizon is not from 1 to 10,000.
+        If the horizon is not from 1 to 10,000, or an action has no limits.
     """
 
     def __init__(self, task: Task, known: Known, horizon: int, seed: int) -> None:
@@ -107,8 +107,7 @@ class DynamicsPolicy:
         self.planner = Planner(known.model, known.cost, horizon=horizon, seed=seed)
         self._settings = np.array([horizon, seed], dtype=np.float64)
         self._indices = task.state_indices
-        self._middle = 0.5 * (task.action_high + task.action_low)
-        self._reach = 0.5 * (task.action_high - task.action_low)
+        self._middle, self._reach = task.action_range()
 
     def reset(self) -> None:
         """Forget the plan."""
@@ -133,7 +132,11 @@ class ModelParameters:
         150, "", "most centres of the sparse Gaussian process", at_least=1, at_most=1000
     )
     trial_seconds: float = parameter(
-        5.0, "s", "how much of a failed trial, from its start, is learned from", above=0
+        5.0,
+        "s",
+        "how much of a failed trial, from its start, is learned from",
+        above=0,
+        at_most=1e9,
     )
     rung: ClassVar[int] = 4
 
@@ -166,8 +169,13 @@ class Dynamics(ModelParameters):
     @staticmethod
     def restore(task: Task, arrays: Mapping[str, Array]) -> DynamicsPolicy:
         """Return the policy that `DynamicsPolicy.arrays` described."""
-        horizon, seed = (int(setting) for setting in arrays["settings"])
-        return DynamicsPolicy(task, Known.restore(task, arrays), horizon, seed)
+        settings = arrays["settings"]
+        if settings.shape != (2,) or not np.all((settings >= 0) & (settings < 2**32)):
+            raise MisstepError(
+                f"the policy's horizon and seed are {settings.tolist()}: two whole numbers, at "
+                f"least 0, are wanted"
+            )
+        return DynamicsPolicy(task, Known.restore(task, arrays), *map(int, settings))
 
 
 def restored_circles(task: Task, arrays: Mapping[str, Array]) -> Circles:

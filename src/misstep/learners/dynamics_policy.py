@@ -81,10 +81,10 @@ class DynamicsPolicySearch(ModelParameters):
         250, "control periods", "length of an imagined rollout", at_least=2, at_most=10_000
     )
     rollouts: int = parameter(
-        2, "", "imagined rollouts of a policy, each from another start", at_least=1
+        2, "", "imagined rollouts of a policy, each from another start", at_least=1, at_most=1000
     )
     generations: int = parameter(400, "", "generations of CMA-ES", at_least=1)
-    population: int = parameter(40, "", "policies in a generation", at_least=4)
+    population: int = parameter(40, "", "policies in a generation", at_least=4, at_most=10_000)
 
     def __post_init__(self) -> None:
         check_parameters(self, "learner dynamics-policy")
@@ -136,6 +136,10 @@ class DynamicsPolicySearch(ModelParameters):
                     f"the policy's {name} has shape {values.shape}: finite numbers of shape "
                     f"{shape} are wanted"
                 )
+        if not np.all(arrays["scale"] > 0.0):
+            raise MisstepError(
+                f"the policy's scale is {arrays['scale'].tolist()}: not all positive"
+            )
         limits = task.action_low, task.action_high
         encoding = Encoding(angles, arrays["mean"], arrays["scale"], *limits)
         return NetworkPolicy(task, circles, encoding, arrays["inner"], arrays["outer"])

@@ -10,7 +10,8 @@ in units of the largest that was used:
 2. *Signed danger* of each way. For a failed attempt that ends in e after the remaining time R, the
    target is z = e^{−R/τ} e with weight e^{−R/(κτ)}, so that only what lies past the point of no
    return counts. Ridge regression z ≈ W [1, x] for each τ; the τ with the highest weighted R² is
-   kept, and the danger is u(x) = (W [1, x]) · v, v the direction in which the ends differ most.
+   kept, and the danger is u(x) = (W [1, x]) · v, v the direction along which the ends lie farthest
+   from s₀.
 3. *What an action does to it.* A horizon ahead, u = c · [1, x, ā] by ridge regression on the mean
    action ā, with the covariance C of the coefficients.
 4. *Cautious control.* The action that minimises E[(u − r)²], uncertainty included:
@@ -22,9 +23,10 @@ the r that the fast danger is to be kept at. The result is linear all the same.
 
 An attempt that lasted less long than the demonstrations did counts for less in all of it: a cart
 that is pushed over shows the push, not the fall. After some trials the weights are drawn from a
-Bayesian bootstrap besides, so that where attempts disagree, the next trial differs; and every other
-of these trials keeps half of the policy that has lasted longest. Attempts that did not fail tell
-what the action does, but not where they would have ended, and are left out of steps 1 and 2.
+Bayesian bootstrap besides, so that where attempts disagree, the next trial differs; and one in two
+of these trials, drawn by lot, keeps half of the policy that has lasted longest. Attempts that did
+not fail tell what the action does, but not where they would have ended, and are left out of steps 1
+and 2.
 """
 
 from collections.abc import Sequence
@@ -93,7 +95,11 @@ class Fall(LinearLearner):
     """Rung 2: learns what a fall looks like from when attempts failed, and pushes against it."""
 
     horizon: float = parameter(
-        0.06, "s", "how far ahead the action's effect is seen on the fastest danger", above=0
+        0.06,
+        "s",
+        "how far ahead the action's effect is seen on the fastest danger",
+        above=0,
+        at_most=3600,
     )
     steady_trials: int = parameter(
         4, "", "trials before the bootstrap makes every further one different", at_least=1
@@ -118,7 +124,7 @@ class Fall(LinearLearner):
         steady = len(evidence.trials) < self.steady_trials
         if not steady:
             weights *= rng.exponential(size=len(cut))
-        centre, half = _limits(task)
+        centre, half = task.action_range()
         # A limit that nobody comes near is no measure of an action.
         used = np.concatenate([np.abs(t.actions - centre) for t in cut]).max(axis=0)
         half = np.minimum(half, used)
@@ -267,11 +273,6 @@ def _until_failure(trajectory: Trajectory) -> Trajectory:
     if step is None or step in (0, trajectory.n_steps):
         return trajectory
     return trajectory.cut(step)
-
-
-def _limits(task: Task) -> tuple[Array, Array]:
-    """Return the middle of the action's range and half of its width, each shape (m,)."""
-    return 0.5 * (task.action_low + task.action_high), 0.5 * (task.action_high - task.action_low)
 
 
 def _with_one(x: Array) -> Array:

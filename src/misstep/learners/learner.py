@@ -95,6 +95,28 @@ class Task:
         names = [column.name for column in self.observation_columns]
         return np.array([names.index(name) for name in self.state], dtype=np.intp)
 
+    def action_range(self) -> tuple[Array, Array]:
+        """Return the middle of each action's range and half of its width, both of shape (m,).
+
+        Raises
+        ------
+        MisstepError
+            If an action has no limits.
+        """
+        self.check_limits()
+        low, high = self.action_low, self.action_high
+        return 0.5 * (low + high), 0.5 * (high - low)
+
+    def check_limits(self) -> None:
+        """Raise MisstepError unless every action has limits."""
+        limited = np.isfinite(self.action_low) & np.isfinite(self.action_high)
+        for column, has_limits in zip(self.action_columns, limited, strict=True):
+            if not has_limits:
+                raise MisstepError(
+                    f"the action {column.name} has no limits, and this learner measures actions by "
+                    f"them: choose another learner, or a system with limits"
+                )
+
     def clipped(self, action: Array) -> Array:
         """Return an action (m,) inside the actuator's limits."""
         limited: Array = np.minimum(np.maximum(action, self.action_low), self.action_high)

@@ -80,6 +80,11 @@ class LinearSpace:
     ----------
     task : Task
     demonstrations : sequence of Trajectory
+
+    Raises
+    ------
+    MisstepError
+        If a column never varies in the demonstrations, or an action has no limits.
     """
 
     def __init__(self, task: Task, demonstrations: Sequence[Trajectory]) -> None:
@@ -87,8 +92,7 @@ class LinearSpace:
         n = len(task.state)
         samples = joint_samples(task, demonstrations)
         self.spread = samples[:, :n].std(axis=0)
-        self.centre = 0.5 * (task.action_low + task.action_high)
-        self.half = 0.5 * (task.action_high - task.action_low)
+        self.centre, self.half = task.action_range()
         self.samples = samples
 
     @property

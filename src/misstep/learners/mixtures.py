@@ -28,7 +28,11 @@ class MixtureParameters:
     max_components: int = parameter(6, "", "largest number that BIC may choose", at_least=1)
     # Without width, components would grow on forces that are clipped at the actuator's limit.
     resolution: float = parameter(
-        0.005, "", "width of the narrowest component, as a share of each column's spread", above=0
+        0.005,
+        "",
+        "width of the narrowest component, as a share of each column's spread",
+        above=0,
+        at_most=1e6,
     )
 
     def fit(

@@ -90,7 +90,9 @@ class Power(LinearLearner):
 
 
 def total_cost(attempt: Trajectory) -> float:
-    """Return the cost of an attempt; steps that a failure cut off cost as much as the worst one.
+    """Return by how much an attempt's steps cost less than its worst one, summed, with a minus.
+
+    Of two attempts that end as badly, the one that lasts longer costs less.
 
     Raises
     ------
@@ -99,7 +101,6 @@ def total_cost(attempt: Trajectory) -> float:
     """
     if attempt.costs is None:
         raise MisstepError("an attempt has no costs: this learner needs the cost of each step")
-    # Of two attempts, the one that lasts longer must not cost more for it.
     return float(attempt.costs.sum() - attempt.costs.max() * attempt.n_steps)
 
 

@@ -11,6 +11,7 @@ near what was done when all went well, away from what was done on the way down, 
 where the good parts disagree.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
-from misstep.learners.donut import SCALE_SHARE
+from misstep.learners.donut import default_scale
 from misstep.learners.learner import LEARNERS, Evidence, Task, joint_samples
 from misstep.learners.mixtures import (
     MixtureParameters,
@@ -28,6 +29,7 @@ from misstep.learners.mixtures import (
     restore_mixture,
 )
 from misstep.mixture import DonutMixture, GaussianMixture, exploration_from_variance
+from misstep.mixture.donut_mixture import check_scale
 from misstep.parameters import check_parameters, parameter
 from misstep.trajectory import Trajectory
 
@@ -51,6 +53,12 @@ class SegmentsPolicy(MixturePolicy):
         s of the exploration formula, in the action's unit.
     repulsion : float
         β.
+
+    Raises
+    ------
+    MisstepError
+        If a mixture has other columns than the task, s or β is out of its range, or there are more
+        than two actions or one without limits.
     """
 
     def __init__(
@@ -62,6 +70,11 @@ class SegmentsPolicy(MixturePolicy):
         repulsion: float,
     ) -> None:
         super().__init__(task, good)
+        check_scale(scale, len(task.action_columns))
+        if not 0.0 <= repulsion < math.inf:
+            raise MisstepError(
+                f"the policy's repulsion is {repulsion:g}: a number, at least 0, is wanted"
+            )
         self.bad = MixturePolicy(task, bad)
         self.scale = scale
         self.repulsion = repulsion
@@ -109,12 +122,11 @@ class Segments(MixtureParameters):
             raise MisstepError(
                 "segments needs the time of at least one failure: set a failure predicate (rung 2)"
             )
-        shown = np.concatenate([t.actions for t in evidence.demonstrations])
         return SegmentsPolicy(
             task,
             self.fit(samples, rng, np.maximum(1.0 - bad, LEAST_WEIGHT)),
             self.fit(samples, rng, np.maximum(bad, LEAST_WEIGHT)),
-            SCALE_SHARE * shown.std(axis=0),
+            default_scale(evidence.demonstrations),
             self.repulsion,
         )
 
@@ -143,6 +155,7 @@ def _grid(task: Task) -> Array:
     m = len(task.action_columns)
     if m not in CANDIDATES:
         raise MisstepError(f"segments handles one or two actions, the system takes {m}")
+    task.check_limits()
     axes = [
         np.linspace(low, high, CANDIDATES[m])
         for low, high in zip(task.action_low, task.action_high, strict=True)

@@ -12,7 +12,6 @@ attempt that is added is appended and changes the number of no other, so changes
 the reverse of their order, whatever was recorded since.
 """
 
-import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -21,7 +20,7 @@ from typing import NamedTuple
 from misstep.errors import MisstepError
 from misstep.formats import append_trajectory, load_dataset, save_dataset
 from misstep.recordings.marking import Mark, marked
-from misstep.runs import make_folder
+from misstep.storage import make_folder
 from misstep.trajectory import Dataset, Trajectory
 
 ATTEMPTS, PENDING, UNDO = "attempts.h5", "pending.h5", "undo"
@@ -181,12 +180,14 @@ class Attempts:
         raise MisstepError("there is nothing to take back")
 
     def _taken_back(self, what: str, place: int, before: Trajectory) -> list[Kept] | None:
-        """Return the attempts as they were; None if the change was never made."""
+        """Return the attempts as they were; None if the change was never made, or all is gone."""
         kept = self._kept
         if place < len(kept) and kept[place].trajectory == before:
             return None
         if what == "delete":
             return [*kept[:place], self._numbered(before), *kept[place:]]
+        if place == len(kept):
+            return None
         return [*kept[:place], Kept(kept[place].id, before), *kept[place + 1 :]]
 
     def _numbered(self, trajectory: Trajectory) -> Kept:
@@ -215,7 +216,7 @@ class Attempts:
     def _changes(self) -> list[tuple[Path, str, int]]:
         """Return file, what and place of every change, first to last."""
         folder = self.folder / UNDO
-        found = [m for m in map(_CHANGE.fullmatch, os.listdir(folder)) if m]
+        found = [m for path in folder.glob("*.h5") if (m := _CHANGE.fullmatch(path.name))]
         found.sort(key=lambda m: int(m[1]))
         return [(folder / m[0], m[2], int(m[3])) for m in found]
 

@@ -6,7 +6,6 @@ where nobody wants to watch.
 """
 
 import json
-import os
 import re
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
@@ -15,9 +14,10 @@ from typing import Any
 from misstep.errors import MisstepError
 from misstep.learners import LEARNERS, LearnedPolicy
 from misstep.live.worker import StoppedError, Worker
-from misstep.runs import CONFIG, load_run, make_folder
+from misstep.runs import CONFIG, load_run
+from misstep.storage import as_file_name, make_folder
 
-_RUN_NAME = re.compile(r"\d{3,}-[a-z0-9-]+", re.ASCII)
+_RUN_NAME = re.compile(r"([0-9]{3,})-[\w.-]+")
 
 
 class Lesson:
@@ -53,9 +53,9 @@ class Lesson:
 
     def runs(self) -> list[str]:
         """Return the names of the runs that are kept, last first."""
-        names = [name for name in os.listdir(self._folder) if _RUN_NAME.fullmatch(name)]
-        kept = [name for name in names if (self._folder / name / CONFIG).exists()]
-        return sorted(kept, key=_number, reverse=True)
+        numbers = self._numbers()
+        kept = [name for name in numbers if (self._folder / name / CONFIG).exists()]
+        return sorted(kept, key=numbers.__getitem__, reverse=True)
 
     def run_folder(self, name: str) -> Path:
         """Return the folder of a run by its name.
@@ -84,8 +84,8 @@ class Lesson:
         **job
             What else the worker's job ``learn`` takes.
         """
-        taken = [_number(name) for name in os.listdir(self._folder) if _RUN_NAME.fullmatch(name)]
-        name = f"{1 + max(taken, default=0):03d}-{learner}"
+        number = 1 + max(self._numbers().values(), default=0)
+        name = f"{number:03d}-{as_file_name(learner)}"
         self._put_on_desk(name, learner, state, max_trials, shown)
         out = str(self._folder / name)
         given = {"learner": learner, "state": list(state), "max_trials": max_trials, "out": out}
@@ -152,6 +152,11 @@ class Lesson:
         numbered = [{"id": number, **one} for number, one in enumerate(shown, start=1)]
         return {**self.run, "own_demonstrations": False}, numbered
 
+    def _numbers(self) -> dict[str, int]:
+        """Return the numbers of the runs in the folder, by name."""
+        found = [_RUN_NAME.fullmatch(path.name) for path in self._folder.glob("*")]
+        return {match[0]: int(match[1]) for match in found if match}
+
     def _put_on_desk(
         self, name: str, learner: str, state: Sequence[str], max_trials: int, shown: int
     ) -> None:
@@ -202,7 +207,3 @@ class Lesson:
             self.trials.append(value["whole"])
             self.run["trials"].append(json.loads(value["summary"]))
         self._changed()
-
-
-def _number(name: str) -> int:
-    return int(name.partition("-")[0])

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from misstep.learners import LEARNERS, DonutPolicy, MixturePolicy, Task
-from misstep.learners.donut import SCALE_SHARE
+from misstep.learners.donut import default_scale
 from misstep.live.attempt import can_start_at, is_one_way
 from misstep.mixture import Conditioner, GaussianMixture
 from misstep.mixture.donut import DEFAULT_K, DEFAULT_REACH
@@ -216,7 +216,7 @@ def show_mixture(
     if mixture is None:
         return None
     k, reach = DEFAULT_K, DEFAULT_REACH
-    scale = SCALE_SHARE * np.concatenate([t.actions for t in attempts]).std(axis=0)
+    scale = default_scale(attempts)
     if isinstance(policy, DonutPolicy):
         scale, k, reach = policy.scale, policy.settings.k, policy.settings.reach
     c = Conditioner(mixture, range(len(task.state)))

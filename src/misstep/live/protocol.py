@@ -131,7 +131,6 @@ KINDS: dict[str, dict[str, Check]] = {
     },
     "resume_run": {"name": _NAME},
     "open_run": {"name": _NAME},
-    "close_run": {},
     "halt": {},
     "next": {"trial": _ID},
     "pace": {"watch": truth},

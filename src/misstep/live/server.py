@@ -31,8 +31,7 @@ from misstep.live.guard import Guard
 from misstep.live.protocol import LONGEST_MESSAGE, Allowance, NotOursError, parse
 from misstep.live.replay import MODULES, PAGE, import_map, page_html, replay_html
 from misstep.live.session import Session, attempt_json
-from misstep.runs import make_folder
-from misstep.storage import write_text
+from misstep.storage import as_file_name, make_folder, write_text
 from misstep.version import __version__
 
 _TOKEN_FILE = "token"  # noqa: S105 - a file's name
@@ -42,7 +41,7 @@ _OURS = 10
 _MOST_WAITING = 400
 """Messages to a page that does not read them, after which it is given up."""
 _LAST_WORD = 2.0  # s, to say why a page is given up
-_MIME = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+_MIME = {".js": "text/javascript", ".css": "text/css"}
 
 
 def open_socket(host: str, port: int) -> socket.socket:
@@ -55,7 +54,8 @@ def open_socket(host: str, port: int) -> socket.socket:
     """
     try:
         # Not reused while another server listens; at once after one has ended.
-        return socket.create_server((host, port), backlog=64)
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        return socket.create_server((host, port), family=family, backlog=64)
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or error
         raise MisstepError(
@@ -232,7 +232,7 @@ def _tell_error(request: Request, error: Exception) -> Response:
 
 
 def _add_page(app: FastAPI) -> None:
-    names = {*MODULES, "style.css", "icon.svg"}
+    names = {*MODULES, "style.css"}
 
     @app.get("/")
     async def page() -> Response:
@@ -275,7 +275,7 @@ def _add_files(app: FastAPI) -> None:
     async def download(format_name: str, id: int | None = None) -> Response:
         now = session()
         chosen = list(now.attempts.dataset) if id is None else [now.attempts[id]]
-        stem = re.sub(r"[^\w.-]", "-", now.name) + ("-attempts" if id is None else "-attempt")
+        stem = as_file_name(now.name) + ("-attempts" if id is None else "-attempt")
         async with downloads.written(now.worker, chosen, format_name) as path:
             return await _attached(path, stem + path.suffix)
 

@@ -9,7 +9,6 @@ one of these modes::
 """
 
 import asyncio
-import re
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Mapping
@@ -41,6 +40,7 @@ from misstep.live.picture import (
 from misstep.live.protocol import Message
 from misstep.live.worker import Worker
 from misstep.recordings.marking import Mark
+from misstep.storage import as_file_name
 from misstep.systems import make_system
 from misstep.trajectory import Outcome, Trajectory
 
@@ -105,14 +105,15 @@ class Session:
     def _use(self, name: str, key: int) -> None:
         """Turn to a system and what has been recorded of it."""
         system = make_system(name, **self._given.get(name, {}))
-        folder = self.folder / re.sub(r"[^\w.-]", "-", name)
-        self.attempts = Attempts(folder)
+        folder = self.folder / as_file_name(name)
+        # All that can fail comes first: where it does, the present system stays as it is.
+        driving, attempts = Driving(system, self._rng), Attempts(folder)
         self.lesson = Lesson(self.worker, folder / "runs", key, self.changed)
+        self.driving, self.attempts = driving, attempts
         self.description = Description(self.worker, self.attempts.path, self._tell_model)
         self._listing = Listing()
         self.system, self.name = system, name
         self.shown_system = show_system(name, system)
-        self.driving = Driving(system, self._rng)
         self.note = ""
         self._set_mode("ended" if self.attempts.pending is not None else "ready")
         self._recorded()
@@ -456,10 +457,6 @@ class Session:
     def _do_open_run(self, name: str) -> None:
         self._need("ready")
         self._start_learning(self.lesson.load(name, self.name, go_on=False))
-
-    def _do_close_run(self) -> None:
-        self._need("ready")
-        self.lesson.close()
 
     def _start_learning(self, end: Awaitable[str]) -> None:
         self.note = ""

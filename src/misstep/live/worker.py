@@ -48,8 +48,10 @@ class Worker:
 
     def start(self) -> None:
         """Start the process, unless it runs."""
-        if self._process is not None and self._process.is_alive():
-            return
+        if self._process is not None:
+            if self._process.is_alive():
+                return
+            self._bury(self._process)  # its listener has not come to say so
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
         process = context.Process(target=_work, args=(theirs,), daemon=True, name="misstep worker")

@@ -10,8 +10,8 @@ from misstep.mixture import compiled
 
 Array = NDArray[np.float64]
 
-SMALLEST = 1e-300
-"""Variance."""
+# The smallest variance whose inverse is a number, with room to spare.
+_SMALLEST = 1e-300
 
 
 def whiteners_of(matrices: Array) -> Array | None:
@@ -21,7 +21,7 @@ def whiteners_of(matrices: Array) -> Array | None:
     decides, nor so small that its inverse leaves the range of numbers.
     """
     variances = np.diagonal(matrices, axis1=1, axis2=2)
-    if not np.all(np.isfinite(matrices)) or not np.all(variances > SMALLEST):
+    if not np.all(np.isfinite(matrices)) or not np.all(variances > _SMALLEST):
         return None
     deviations = np.sqrt(variances)
     rounding = 1e-9 * deviations[:, :, None] * deviations[:, None, :]

@@ -104,10 +104,11 @@ def survey(chunks: Iterable[ArrayLike], size: int, rng: np.random.Generator) -> 
             reservoir = np.empty((size, chunk.shape[1]))
         m = len(chunk)
         # Chan, Golub & LeVeque: moments of two parts from those of each.
-        own = chunk.mean(axis=0)
-        gap = own - mean
-        squares += ((chunk - own) ** 2).sum(axis=0) + gap**2 * (n * m / (n + m))
-        mean = mean + gap * (m / (n + m))
+        with np.errstate(over="ignore", invalid="ignore"):
+            own = chunk.mean(axis=0)
+            gap = own - mean
+            squares += ((chunk - own) ** 2).sum(axis=0) + gap**2 * (n * m / (n + m))
+            mean = mean + gap * (m / (n + m))
         _draw_into(reservoir, chunk, n, rng)
         n += m
     if n < 2:

@@ -17,17 +17,15 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-REORDER = {"reassoc", "contract", "nsz", "arcp"}
-_COMPILED: dict[str, Any] = {"cache": True, "nogil": True, "_nrt": False}
+COMPILED: dict[str, Any] = {"cache": True, "nogil": True, "_nrt": False}
 _INLINED: dict[str, Any] = {"forceinline": True, "_nrt": False}
 LOG_2PI = math.log(2.0 * math.pi)
-
 
 # Of a variance of which no larger share is left by the columns before, rounding is most of it.
 SINGULAR = 1e-14
 
 
-@njit(**_COMPILED)
+@njit(**COMPILED)
 def cholesky_whitener(covariance, whitener):
     """Fill `whitener` with W = L⁻¹ of L Lᵀ = `covariance`; return log det W.
 
@@ -60,7 +58,7 @@ def cholesky_whitener(covariance, whitener):
     return log_det
 
 
-@njit(**_COMPILED)
+@njit(**COMPILED)
 def precompute(weights, covariances, whiteners, constants):
     """Fill `whiteners` (K, d, d) and `constants` (K,); False if a covariance is not definite."""
     d = covariances.shape[1]
@@ -78,7 +76,7 @@ NEGLIGIBLE = 45.0
 LOWEST = -1e300
 
 
-def scratch_for(K: int, d: int) -> NDArray[np.float64]:
+def scratch_for(K: int, d: int) -> Array:
     """Return the room that a query of K components and d actions works in."""
     return np.empty(K * (3 + 2 * d) + 6 * d + 3 * d * d)
 
@@ -110,7 +108,7 @@ def _matrix_room(scratch, n_components, d, i):
     return scratch[begin : begin + d * d].reshape((d, d))
 
 
-@njit(**_COMPILED)
+@njit(**COMPILED)
 def condition(state, constants, state_means, whiteners, gains, action_means, h, m):
     """Gaussian mixture regression at one state: fill h (K,) and the conditional means m (K, d)."""
     n_components, n = state_means.shape
@@ -140,14 +138,14 @@ def condition(state, constants, state_means, whiteners, gains, action_means, h, 
         h[k] /= total
 
 
-@njit(**_COMPILED)
+@njit(**COMPILED)
 def conditions(states, constants, state_means, whiteners, gains, action_means, h, m):
     """`condition` at many states (N, n): fill h (N, K) and m (N, K, d)."""
     for i in range(states.shape[0]):
         condition(states[i], constants, state_means, whiteners, gains, action_means, h[i], m[i])
 
 
-@njit(**_COMPILED)
+@njit(**COMPILED)
 def scaled_variance(h, m, covariances, scale):
     """‖V‖/s² = tr(V/s²)/d, the spread of the conditional mixture in units of `scale` (d,)."""
     n_components, d = m.shape
@@ -165,12 +163,12 @@ def scaled_variance(h, m, covariances, scale):
     return total / d
 
 
-@njit(**_COMPILED)
+@njit(**COMPILED)
 def exploration_of(spread, printed):
-    """ε of V/s², which may have overflowed."""
-    if printed:
-        return 1.0 / (1.0 + spread)
-    return spread / (1.0 + spread) if spread < np.inf else 1.0
+    """ε of V/s², which may have overflowed, to infinity or to what is no number."""
+    if not spread < np.inf:
+        return 0.0 if printed else 1.0
+    return 1.0 / (1.0 + spread) if printed else spread / (1.0 + spread)
 
 
 @njit(**_INLINED)
@@ -201,7 +199,7 @@ def _log_donut(squared, log_norm, terms):
     return log_norm + log_width - 0.5 * a2 * squared + math.log(bracket), slope
 
 
-@njit(**_COMPILED)
+@njit(**COMPILED)
 def donut_log_density(squared, log_norm, gamma, r_alpha, r_beta, d):
     """Return log D at Mahalanobis² `squared`, and the factor g in ∇ log D = g Σ⁻¹(a − μ)."""
     return _log_donut(squared, log_norm, _donut_terms((gamma, r_alpha, r_beta), d))
@@ -237,7 +235,7 @@ def _log_donuts(a, log_h, m, whiteners, log_norms, shape, value, slope, directio
     return top
 
 
-@njit(**_COMPILED)
+@njit(**COMPILED)
 def mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, metric, scratch):
     """Return log DMM(a); fill its gradient (d,) and the metric (d, d), the mean precision there.
 
@@ -274,7 +272,7 @@ def mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, metric, 
     return top + math.log(total)
 
 
-@njit(**_COMPILED)
+@njit(**COMPILED)
 def mixture_densities(points, log_h, m, whiteners, log_norms, shape, values, gradients, scratch):
     """`mixture_density` at many points (N, d): fill `values` (N,) and `gradients` (N, d)."""
     n_components, d = m.shape
@@ -285,7 +283,7 @@ def mixture_densities(points, log_h, m, whiteners, log_norms, shape, values, gra
         )
 
 
-@njit(**_COMPILED)
+@njit(**COMPILED)
 def solve_definite(matrix, right, out, whitener, y):
     """Solve `matrix` · out = `right` for a positive definite matrix (d, d).
 
@@ -316,7 +314,7 @@ NUDGE = 1e-3
 MAX_ASCENT = 500
 
 
-@njit(**_COMPILED)
+@njit(**COMPILED)
 def ascend(a, log_h, m, whiteners, log_norms, shape, scratch):
     """Climb from `a` (overwritten) to a local maximum of the donut mixture; return its log density.
 
@@ -392,7 +390,7 @@ def ascend(a, log_h, m, whiteners, log_norms, shape, scratch):
     return value
 
 
-@njit(**_COMPILED)
+@njit(**COMPILED)
 def best_candidate(a, log_h, m, whiteners, lowers, log_norms, shape, ridge, scratch):
     """Overwrite `a` with the densest of the centres and the points on each component's ridge."""
     n_components, d = m.shape
@@ -424,7 +422,7 @@ def best_candidate(a, log_h, m, whiteners, lowers, log_norms, shape, ridge, scra
                     a[i] = candidate[i]
 
 
-@njit(**_COMPILED)
+@njit(**COMPILED)
 def donut_shape(exploration, d, k, reach):
     """γ, r_α, r_β of the exploration family, and the Mahalanobis radius of its ridge (0: none)."""
     r_alpha = 1.0 / (1.0 + (reach - 1.0) * exploration)
@@ -437,7 +435,7 @@ def donut_shape(exploration, d, k, reach):
     return (gamma, r_alpha, r_beta), ridge
 
 
-@njit(**_COMPILED)
+@njit(**COMPILED)
 def answer(
     state,
     action,

@@ -47,9 +47,9 @@ class Conditional(NamedTuple):
 
         Where means lie so far apart that an entry leaves the range of numbers, it is infinite.
         """
-        deviations = self.means - self.mean
-        deviations[self.weights == 0.0] = 0.0  # 0 × ∞ is no number
         with np.errstate(over="ignore", invalid="ignore"):
+            deviations = self.means - self.mean
+            deviations[self.weights == 0.0] = 0.0  # 0 × ∞ is no number
             outer = deviations[:, :, None] * deviations[:, None, :]
             variance = np.einsum("k,kij->ij", self.weights, self.covariances + outer)
         variance[np.isnan(variance)] = np.inf

@@ -44,8 +44,7 @@ def exploration_from_variance(
         finite, or there is no such formula.
     """
     v, s = np.array(variance, dtype=np.float64), np.array(scale, dtype=np.float64)
-    if formula not in FORMULAS:
-        raise MisstepError(f"the formula is 'prose' or 'printed', got {formula!r}")
+    check_formula(formula)
     if s.ndim != 1 or v.shape != 2 * s.shape or not np.all((s > 0) & (s < np.inf)):
         raise MisstepError(
             f"exploration takes a variance (d, d) and a positive scale (d,), got {v.shape} and "
@@ -59,6 +58,20 @@ def exploration_from_variance(
         spread = float(np.mean(np.diag(v) / s**2))
     exploration: float = compiled.exploration_of(spread, formula == "printed")
     return exploration
+
+
+def check_formula(formula: str) -> None:
+    """Raise MisstepError unless there is such a formula of the exploration."""
+    if formula not in FORMULAS:
+        raise MisstepError(f"the formula is 'prose' or 'printed', got {formula!r}")
+
+
+def check_scale(scale: Array, d: int) -> None:
+    """Raise MisstepError unless s holds d positive numbers whose squares are numbers too."""
+    if scale.shape != (d,) or not np.all((scale > 1e-150) & (scale < 1e150)):
+        raise MisstepError(
+            f"the scale must be {d} positive numbers, 1e-150 to 1e150, got {scale.tolist()}"
+        )
 
 
 class DonutMixture:

@@ -12,7 +12,9 @@ import math
 from numba import njit, types
 from numba.extending import intrinsic
 
+# Fast-math of the two functions here, and of the loops that call them.
 CONTRACT = {"contract"}
+REORDER = {"reassoc", "contract", "nsz", "arcp"}
 
 # Adding 1.5·2⁵² to a small whole double leaves that whole number in the low bits of the sum.
 _TO_LOW_BITS = 6755399441055744.0

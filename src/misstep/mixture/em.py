@@ -24,8 +24,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from misstep.mixture.compiled import REORDER, precompute
-from misstep.mixture.elementary import exp_nonpositive, log_positive
+from misstep.mixture.compiled import COMPILED, precompute
+from misstep.mixture.elementary import REORDER, exp_nonpositive, log_positive
 
 Array = NDArray[np.float64]
 
@@ -34,7 +34,6 @@ PANEL = 4
 # Variance as a share of a squared step of the mean, below which rounding takes six digits of it.
 JUMP = 1e-10
 
-COMPILED: dict[str, Any] = {"cache": True, "nogil": True, "_nrt": False}
 INLINED: dict[str, Any] = {"fastmath": REORDER, "forceinline": True, "_nrt": False}
 
 

@@ -59,6 +59,11 @@ def available_threads() -> int:
         return int(limit)
     if multiprocessing.parent_process() is not None:
         return 1
+    return available_cores()
+
+
+def available_cores() -> int:
+    """Return how many cores this process may use, which can be fewer than there are."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:

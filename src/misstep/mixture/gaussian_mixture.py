@@ -183,8 +183,8 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         Raises
         ------
         MisstepError
-            If a column is constant, a weight is negative, a setting is out of range or there are
-            more components than samples.
+            If a column is constant or its variance no number, a weight is negative, a setting is
+            out of range or there are more components than samples.
         ValueError
             If `X` is not a finite matrix of at least two samples (scikit-learn's own messages).
         """
@@ -231,7 +231,7 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         found = survey(chunks, n_subsample, np.random.default_rng(self.random_state))
         self.n_features_in_ = len(found.mean)
         self._check_settings()
-        _refuse_constant(found.subsample[0], np.abs(found.subsample).max(axis=0), found.scale)
+        _check_spread(found.subsample[0], np.abs(found.subsample).max(axis=0), found.scale)
         offset, scale = found.mean, found.scale
         samples, weight = starts.sort_samples(found.subsample, np.ones(len(found.subsample)))
         Z = (samples - offset) / scale
@@ -345,9 +345,12 @@ class GaussianMixture(DensityMixin, BaseEstimator):
 
     def _check_settings(self) -> None:
         bounds = {"n_components": 1, "max_components": 1, "n_init": 1, "max_iter": 0, "n_jobs": 1}
+        optional = {"n_components", "n_jobs"}
         for name, least in bounds.items():
             value = getattr(self, name)
-            if value is not None and (not isinstance(value, int | np.integer) or value < least):
+            if value is None and name in optional:
+                continue
+            if not isinstance(value, int | np.integer) or value < least:
                 raise MisstepError(f"{name} must be a whole number ≥ {least}, got {value!r}")
         for name in ("tol", "covariance_floor"):
             value = getattr(self, name)
@@ -540,16 +543,22 @@ def _standardise(X: Array, weight: Array) -> tuple[Array, Array, Array]:
     columns = np.ascontiguousarray(X.T)
     total = weight.sum()
     first, extent = X[0], np.maximum(columns.max(axis=1), -columns.min(axis=1))
-    offset = (columns * weight).sum(axis=1) / total
-    columns -= offset[:, None]
-    scale = np.sqrt((columns**2 * weight).sum(axis=1) / total)
-    _refuse_constant(first, extent, scale)
+    with np.errstate(over="ignore", invalid="ignore"):
+        offset = (columns * weight).sum(axis=1) / total
+        columns -= offset[:, None]
+        scale = np.sqrt((columns**2 * weight).sum(axis=1) / total)
+    _check_spread(first, extent, scale)
     columns /= scale[:, None]
     return columns.T, offset, scale
 
 
-def _refuse_constant(first: Array, extent: Array, scale: Array) -> None:
-    """Raise MisstepError if a column, of which `first` is a value, hardly varies."""
+def _check_spread(first: Array, extent: Array, scale: Array) -> None:
+    """Raise MisstepError if a column, of which `first` is a value, hardly varies, or too much."""
+    wide = np.flatnonzero(~np.isfinite(scale))
+    if len(wide):
+        raise MisstepError(
+            f"column {wide[0]} of X ranges so far that its variance leaves the range of numbers"
+        )
     constant = np.flatnonzero(scale <= CONSTANT * extent)
     if len(constant):
         column = int(constant[0])

@@ -3,12 +3,11 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from misstep.errors import MisstepError
 from misstep.mixture import compiled
 from misstep.mixture.checks import checked_points
 from misstep.mixture.conditional import Conditioner
 from misstep.mixture.donut import DEFAULT_K, DEFAULT_REACH, check_family, check_hole
-from misstep.mixture.donut_mixture import FORMULAS, component_arrays
+from misstep.mixture.donut_mixture import check_formula, check_scale, component_arrays
 
 Array = NDArray[np.float64]
 
@@ -43,15 +42,12 @@ class DonutQuery:
     ) -> None:
         c = conditioner
         K, d = c.action_means.shape
+        self._n, self._d = c.state_means.shape[1], d
         check_family(k, reach)
         check_hole(k, d)
         s = np.array(scale, dtype=np.float64)
-        if s.shape != (d,) or not np.all((s > 1e-150) & (s < 1e150)):  # they are squared
-            raise MisstepError(
-                f"the scale must be {d} positive numbers, 1e-150 to 1e150, got {s.tolist()}"
-            )
-        if formula not in FORMULAS:
-            raise MisstepError(f"the formula is 'prose' or 'printed', got {formula!r}")
+        check_scale(s, d)
+        check_formula(formula)
         self._family = (formula == "printed", float(k), float(reach), s)
         self._arrays = (
             c.state_constants,
@@ -89,7 +85,7 @@ class DonutQuery:
         MisstepError
             If `states` has another shape or is not finite.
         """
-        x = checked_points(states, self._arrays[1].shape[1])
-        actions = np.zeros((len(x), len(self._family[-1])))
+        x = checked_points(states, self._n)
+        actions = np.zeros((len(x), self._d))
         epsilons = [self.explore(*pair, warm=False) for pair in zip(x, actions, strict=True)]
         return actions, np.array(epsilons)

@@ -11,7 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from misstep.mixture.em import BLOCK, COMPILED, Mixture, Samples
+from misstep.mixture.compiled import COMPILED
+from misstep.mixture.em import BLOCK, Mixture, Samples
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int32]

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -47,7 +48,7 @@ def draw(name: str, folder: Path, results: Results) -> None:
 def _donut_family(results: Results) -> Figure:
     figure, axes = plots.new_figure()
     grid = np.linspace(-5, 5, 601)[:, None]
-    colours = plots.mpl.colormaps["viridis"](np.linspace(0.0, 0.85, 6))
+    colours = mpl.colormaps["viridis"](np.linspace(0.0, 0.85, 6))
     for exploration, colour in zip(np.linspace(0, 1, 6), colours, strict=True):
         donut = Donut([0.0], [[1.0]], DonutShape.of(float(exploration), d=1))
         axes.plot(grid[:, 0], donut.pdf(grid), color=colour, lw=1.8, label=f"ε = {exploration:.1f}")
@@ -204,7 +205,7 @@ def _mark_paper(axes: Axes, table: Array) -> None:
     numbers = np.arange(1, len(table) + 1)
     for column in range(len(HORIZONS)):
         axes.plot(
-            numbers + (column - 1) * 0.27,
+            numbers + (column - 1) * plots.BAR_STEP,
             table[:, column],
             "_",
             ms=9,

@@ -31,8 +31,8 @@ from misstep.paper.results import SHOWN_RUNS, Results, collect_calibration
 from misstep.paper.sequel import keep_sequel, summary, write_sequel_video
 from misstep.paper.synthetic import SyntheticMeasures, run_synthetic, synthetic_measures
 from misstep.paper.videos import VIDEOS, Video, choose_videos, write_video_once
-from misstep.runs import load_run, make_folder, read_json
-from misstep.storage import write_json, write_text
+from misstep.runs import load_run
+from misstep.storage import make_folder, read_json, write_json, write_text
 from misstep.version import __version__, command_line
 from misstep.workers import Progress, Tally, check_workers, process_pool, silent
 
@@ -147,8 +147,8 @@ def resume(out: Path, *, workers: int | None = None, progress: Progress | None =
 
 def _run(out: Path, config: ReproductionConfig, workers: int, progress: Progress) -> Path:
     missing = [cell for cell in config.cells if not _cell_file(out, *cell).exists()]
-    tally = Tally(progress, total=len(config.cells) + len(figures.FIGURES) + VIDEOS + 2)
-    tally.done = len(config.cells) - len(missing)
+    total = len(config.cells) + len(figures.FIGURES) + VIDEOS + 2
+    tally = Tally(progress, total, done=len(config.cells) - len(missing))
     with process_pool(workers) as pool:
         calibrations, synthetic = _measure_apart(config, pool)
         sequel = pool.submit(keep_sequel, out / "runs" / SEQUEL, config.seed)

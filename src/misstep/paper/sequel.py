@@ -15,7 +15,6 @@ from misstep.paper.experiments import DEMONSTRATIONS
 from misstep.runs import CONFIG, Run, load_run
 from misstep.systems import make_system
 from misstep.systems.rendering import write_side_by_side
-from misstep.trajectory import Outcome
 
 LEARNER = "fall"
 SYSTEM = "cartpole-rail"
@@ -63,5 +62,5 @@ def summary(run: Run) -> dict[str, Any]:
         "trials_lasted_s": [
             t.duration if t.failure_time is None else t.failure_time for t in run.trials
         ],
-        "succeeded": run.trials[-1].outcome is Outcome.SUCCESS,
+        "succeeded": run.succeeded,
     }

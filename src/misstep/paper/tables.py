@@ -17,14 +17,14 @@ def all_tables(results: Results) -> dict[str, Any]:
     """Return every table as JSON can hold it."""
     return {
         "horizons_s": list(HORIZONS),
-        "I": table_1(results),
+        "I": _table_1(results),
         "II": _table_2(results, "without-reward"),
         "with_reward": _table_2(results, "with-reward"),
-        "variants": variants(results),
+        "variants": _variants(results),
     }
 
 
-def table_1(results: Results) -> dict[str, Any]:
+def _table_1(results: Results) -> dict[str, Any]:
     """Table I: the demonstrations of the first seed, and where the paper's numbers fall in all."""
     shown = results.demonstration_costs("without-reward").reshape(-1, len(HORIZONS))
     return {
@@ -61,7 +61,7 @@ def _inside(costs: Array) -> list[int]:
     return counts
 
 
-def variants(results: Results) -> list[dict[str, Any]]:
+def _variants(results: Results) -> list[dict[str, Any]]:
     """One row a variant: mean costs with their standard error over seeds, successes, models."""
     rows = []
     for name, cells in results.cells.items():

@@ -13,8 +13,7 @@ import numpy as np
 
 from misstep.formats.format import Block, Ending, Episode, FloatArray
 from misstep.trajectory import Column
-
-_PERIODS = {"rad": 2.0 * np.pi, "deg": 360.0}
+from misstep.units import TURNS
 
 Convention = Literal["recorded", "wrapped", "unwrapped"]
 
@@ -28,7 +27,7 @@ class Turns:
     """
 
     def __init__(self, columns: Sequence[Column]) -> None:
-        self._periods = np.array([_PERIODS.get(column.unit, np.inf) for column in columns])
+        self._periods = np.array([TURNS.get(column.unit, np.inf) for column in columns])
         self._last: FloatArray | None = None  # the last row, as recorded
         self._offset = np.zeros(len(columns))  # what was added to it
         self._middle = np.full(len(columns), np.nan)  # of the recorded turn, once there was a jump

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
 from misstep.formats.format import Block, Episode, Header
-from misstep.recordings.equations import EquationCheck, check_equations
+from misstep.recordings.equations import EquationCheck, check_equations, explained
 from misstep.recordings.motion import FEWEST_ROWS
 from misstep.systems import JUDGE_PARAMETERS, SYSTEMS, System, make_system
 from misstep.trajectory import Outcome, Trajectory
@@ -157,7 +157,7 @@ class Beginnings:
         recorded = [
             (number, _trajectory(header, np.concatenate(tables), system))
             for number, (header, tables) in enumerate(self._kept)
-            if sum(map(len, tables)) >= FEWEST_ROWS
+            if sum(map(len, tables)) > 1
         ]
         checked: list[EquationCheck] = []
         for _, group in groupby(recorded, key=lambda pair: pair[1].dt):
@@ -197,15 +197,11 @@ def _verdict(checks: Sequence[EquationCheck], total: int) -> str:
         f"R² {_least(c.r_squared for c in checks)}, residual at most "
         f"{max(c.residual for c in checks):.3g} {first.unit}"
     )
-    better = ", or ".join(
+    better = [
         f"{fit.change} (R² {_least(c.fits[i].r_squared for c in checks)})"
         for i, fit in enumerate(first.fits)
-    )
-    if better:
-        return f"{line}; it fits better with {better}"
-    if not first.holds:
-        return f"{line}; no unit, sign, zero, rate or parameter that was tried explains it"
-    return line
+    ]
+    return explained(line, first.holds, better)
 
 
 def _least(shares: Iterable[float | None]) -> str:

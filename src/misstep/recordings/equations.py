@@ -84,7 +84,8 @@ class EquationCheck:
     residual : float
         Root mean square of recorded minus expected acceleration, in `unit`.
     r_squared : float or None
-        Share of the acceleration's variance that the equation explains; None where nothing moves.
+        Share of the acceleration's variance that the equation explains; None where nothing moves,
+        or only in blows and beyond the stops.
     fits : tuple of Fit
         What would explain it better, best first.
     findings : tuple of Finding
@@ -112,17 +113,25 @@ class EquationCheck:
     @property
     def _verdict(self) -> str:
         if self.r_squared is None:
-            return f"{self.column} does not accelerate: its equation cannot be checked"
+            return (
+                f"{self.column} does not accelerate where nothing is hit: its equation cannot be "
+                "checked"
+            )
         verdict = (
             f"the equation of {self.column} {'holds' if self.holds else 'does not hold'}: "
             f"R² {_share(self.r_squared)}, residual {self.residual:.3g} {self.unit}"
         )
-        better = ", or ".join(f"{fit.change} (R² {_share(fit.r_squared)})" for fit in self.fits)
-        if better:
-            return f"{verdict}; it fits better with {better}"
-        if not self.holds:
-            return f"{verdict}; no unit, sign, zero, rate or parameter that was tried explains it"
-        return verdict
+        better = [f"{fit.change} (R² {_share(fit.r_squared)})" for fit in self.fits]
+        return explained(verdict, self.holds, better)
+
+
+def explained(verdict: str, holds: bool, better: Sequence[str]) -> str:
+    """Return a verdict with what fits better, or that nothing explains what does not hold."""
+    if better:
+        return f"{verdict}; it fits better with {', or '.join(better)}"
+    if not holds:
+        return f"{verdict}; no unit, sign, zero, rate or parameter that was tried explains it"
+    return verdict
 
 
 def check_equations(trajectories: Iterable[Trajectory], system: System) -> list[EquationCheck]:
@@ -331,7 +340,9 @@ def _share(r_squared: float) -> str:
 
 
 def _noise_share(recordings: Sequence[_Recording], rows: Rows, mechanics: Mechanics) -> float:
-    """Return the least share of a free joint's acceleration that is noise."""
+    """Return the least share of a free joint's acceleration that is noise; 0 without rows."""
+    if not len(rows.accelerations):
+        return 0.0
     noise = np.median([recording.noise for recording in recordings], axis=0)[mechanics.free]
     spread = rows.accelerations[:, mechanics.free].var(axis=0)
     return float(np.min(noise**2 / np.maximum(spread, 1e-12)))

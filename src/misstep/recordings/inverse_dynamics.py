@@ -20,7 +20,8 @@ from misstep.formats.format import Block, Ending, Episode, Header
 from misstep.recordings.motion import Finding, Joints, Motion
 from misstep.systems import System
 from misstep.systems.mechanics import Mechanics
-from misstep.trajectory import Column, Trajectory
+from misstep.trajectory import Column
+from misstep.units import TURNS
 
 Array = NDArray[np.float64]
 
@@ -117,58 +118,22 @@ def findings_of(motion: Motion, system: System, dt: float) -> tuple[Finding, ...
     return _blows(_forces(motion, mechanics, dt), motion, system, mechanics, dt)
 
 
-def infer_actions(trajectory: Trajectory, system: System) -> Trajectory:
-    """Return a trajectory with the actions of a known system that explain its motion.
+def inferring_actions(episode: Episode, system: System) -> Episode:
+    """Infer the actions of an episode of a known system on its way, in bounded memory.
+
+    Velocities of the system that were not recorded are added, as the change of their positions.
 
     Parameters
     ----------
-    trajectory : Trajectory
+    episode : Episode
         Whatever actions it has are replaced.
     system : System
 
     Returns
     -------
-    Trajectory
-        With the system's action columns, and as of this system. The notes of its provenance say
-        what was inferred and what was found.
-
-    Raises
-    ------
-    MisstepError
-        As `inverse_dynamics`.
-    """
-    return inferring_actions(Episode.of(trajectory), system).trajectory()
-
-
-def infer_velocities(trajectory: Trajectory, names: Sequence[str] | None = None) -> Trajectory:
-    """Return a trajectory whose actions are the velocities of its observations, the paper's ξ̇.
-
-    An action leads from one observation exactly to the next: o[t+1] = o[t] + dt · a[t].
-
-    Parameters
-    ----------
-    trajectory : Trajectory
-        Whatever actions it has are replaced.
-    names : sequence of str, optional
-        Observation columns whose velocities to take; all if left out. Those in rad or deg wrap.
-
-    Returns
-    -------
-    Trajectory
-        With an action column ``NAME_dot`` for each, in its unit per second.
-
-    Raises
-    ------
-    MisstepError
-        If there is no such column.
-    """
-    return inferring_velocities(Episode.of(trajectory), names).trajectory()
-
-
-def inferring_actions(episode: Episode, system: System) -> Episode:
-    """Infer the actions of an episode on its way, see `infer_actions`; in bounded memory.
-
-    Velocities of the system that were not recorded are added, as the change of their positions.
+    Episode
+        With the system's action columns, and as of this system. The notes of its ending say what
+        was inferred and what was found.
 
     Raises
     ------
@@ -186,7 +151,7 @@ def inferring_actions(episode: Episode, system: System) -> Episode:
                 part.observations, columns, dt, system, half_width=half_width
             )
             half_width = inferred.motion.half_width
-            found.add(inferred, part.own, part.start, dt)
+            found.add(inferred, part, dt)
             whole = missing.added(part.observations, inferred.motion)
             yield Block(whole[part.own_rows], inferred.actions[part.own], part.costs)
 
@@ -211,8 +176,8 @@ def inferring_actions(episode: Episode, system: System) -> Episode:
 class _Missing:
     """The velocities of a system that a recording lacks.
 
-    `joints` are those whose velocity is missing, `order` where the columns of the table with them
-    at its end belong in `all_columns`: as the system has them, where they are all there.
+    `joints` are those whose velocity is missing. With them at its end, column `order[i]` of the
+    table becomes column i of `all_columns`: as the system has them, where they are all there.
     """
 
     joints: list[int]
@@ -235,8 +200,9 @@ class _Missing:
     @property
     def notes(self) -> tuple[str, ...]:
         """What is to be noted."""
-        added = {self.order.index(len(self.order) - 1 - i) for i in range(len(self.joints))}
-        names = ", ".join(self.all_columns[i].name for i in sorted(added))
+        recorded = len(self.order) - len(self.joints)
+        pairs = zip(self.order, self.all_columns, strict=True)
+        names = ", ".join(column.name for place, column in pairs if place >= recorded)
         return (f"{names}: not recorded, the change of their positions",) if names else ()
 
     def added(self, observations: Array, motion: Motion) -> Array:
@@ -250,7 +216,21 @@ class _Missing:
 
 
 def inferring_velocities(episode: Episode, names: Sequence[str] | None = None) -> Episode:
-    """Take the velocities of an episode for its actions on its way, see `infer_velocities`.
+    """Take the velocities of an episode on its way for its actions: the paper's ξ̇.
+
+    An action leads from one observation exactly to the next: o[t+1] = o[t] + dt · a[t].
+
+    Parameters
+    ----------
+    episode : Episode
+        Whatever actions it has are replaced.
+    names : sequence of str, optional
+        Observation columns whose velocities to take; all if left out. Those in rad or deg wrap.
+
+    Returns
+    -------
+    Episode
+        With an action column ``NAME_dot`` for each, in its unit per second.
 
     Raises
     ------
@@ -266,7 +246,7 @@ def inferring_velocities(episode: Episode, names: Sequence[str] | None = None) -
                 f"there is no observation column {name!r}; there are: {', '.join(known)}"
             )
     indices = [known.index(name) for name in chosen]
-    periods = np.array([{"rad": 2 * np.pi, "deg": 360.0}.get(columns[i].unit, 0) for i in indices])
+    periods = np.array([TURNS.get(columns[i].unit, 0.0) for i in indices])
 
     def blocks() -> Iterator[Block]:
         last = np.empty((0, len(columns)))
@@ -339,17 +319,17 @@ class _Found:
         self._clipped = 0
         self._largest = 0.0
 
-    def add(self, inferred: InferredActions, own: slice, start: int, dt: float) -> None:
-        """Add what was found in the own rows of a part that starts at row `start`."""
+    def add(self, inferred: InferredActions, part: _Part, dt: float) -> None:
+        """Add what was found in the own rows of a part."""
         self._half_width = inferred.motion.half_width
-        forces, actions = inferred.forces[own], inferred.actions[own]
+        forces, actions = inferred.forces[part.own], inferred.actions[part.own]
         self._steps += len(forces)
         self._clipped += int(np.any(forces != actions, axis=1).sum())
         self._largest = max(self._largest, float(np.abs(forces).max(initial=0.0)))
         for finding in inferred.findings:
             row = 0 if finding.time is None else round(finding.time / dt)
-            if own.start <= row < own.stop:
-                self._findings.append(_later(finding, start * dt))
+            if part.own_rows.start <= row < part.own_rows.stop:
+                self._findings.append(_later(finding, part.start * dt))
 
     def notes(self, dt: float) -> tuple[str, ...]:
         """Return the notes for the provenance."""

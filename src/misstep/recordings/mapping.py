@@ -121,9 +121,8 @@ class ColumnMapping:
     def __post_init__(self) -> None:
         if self.named not in (None, True, False):
             raise MisstepError(f"named is {self.named!r}: it is true or false")
-        if self.rate is not None and not (
-            isinstance(self.rate, int | float) and 0 < self.rate <= LARGEST
-        ):
+        is_number = isinstance(self.rate, int | float) and not isinstance(self.rate, bool)
+        if self.rate is not None and not (is_number and 0 < self.rate <= LARGEST):
             raise MisstepError(f"the rate is {_told(self.rate)}: it has to be positive, in Hz")
         for field in ("time", "episode"):
             if not isinstance(getattr(self, field), str):
@@ -180,9 +179,9 @@ class ColumnMapping:
 
 def _told(value: object) -> str:
     """Return a value as a message has it."""
-    if isinstance(value, int) and abs(value) > LARGEST:
-        return "too large"
-    return f"{value:g}" if isinstance(value, int | float) else repr(value)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return repr(value)
+    return "too large" if isinstance(value, int) and abs(value) > LARGEST else f"{value:g}"
 
 
 # Applying
@@ -266,18 +265,19 @@ def _index(source: str, columns: tuple[Column, ...]) -> int | None:
 def _blocks(
     episode: Episode, observations: Sequence[_Part], actions: Sequence[_Part]
 ) -> Iterator[Block]:
-    late = any(part.of_observations for part in actions)
+    if not any(part.of_observations for part in actions):
+        for block in episode.blocks:
+            made = _values(block.observations, observations)
+            yield replace(block, observations=made, actions=_values(block.actions, actions))
+        return
+    if not all(part.of_observations for part in actions):
+        raise MisstepError(
+            "some actions come from observations and some from actions: name the columns of one "
+            "kind only"
+        )
     kept = np.empty((0, len(actions)))
     for block in episode.blocks:
         made = _values(block.observations, observations)
-        if not late:
-            yield replace(block, observations=made, actions=_values(block.actions, actions))
-            continue
-        if not all(part.of_observations for part in actions):
-            raise MisstepError(
-                "some actions come from observations and some from actions: name the columns of "
-                "one kind only"
-            )
         # The last row of an action that was recorded beside the observations leads nowhere.
         rows = np.concatenate([kept, _values(block.observations, actions)])
         kept = rows[-1:]

@@ -230,7 +230,6 @@ def _cut(trajectory: Trajectory, start: float, end: float) -> Trajectory:
             f"it failed at {failed * trajectory.dt:g} s, before the usable part from {start:g} s: "
             "mark another failure time or part"
         )
-    kept = failed is not None and failed <= last
     text = (
         f"usable part: {first * trajectory.dt:g} to {last * trajectory.dt:g} s of "
         f"{trajectory.duration:g} s{_BY_HAND}"
@@ -241,7 +240,7 @@ def _cut(trajectory: Trajectory, start: float, end: float) -> Trajectory:
         observations=trajectory.observations[first : last + 1],
         actions=trajectory.actions[first:last],
         costs=None if trajectory.costs is None else trajectory.costs[first:last],
-        failure_step=failed - first if failed is not None and kept else None,
+        failure_step=None if failed is None or failed > last else failed - first,
         provenance=replace(source, notes=(*source.notes, text)),
     )
 

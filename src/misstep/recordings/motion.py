@@ -45,8 +45,7 @@ class Finding:
     Parameters
     ----------
     kind : str
-        ``"spike"``, ``"jolt"``, ``"stop"``, ``"limit"``, ``"units"``, ``"rate"``, ``"mapping"``,
-        ``"parameter"`` or ``"motion"``.
+        ``"spike"``, ``"jolt"``, ``"stop"``, ``"limit"``, ``"units"``, ``"rate"`` or ``"mapping"``.
     sentence : str
         What it is, in words.
     time : float or None, s

@@ -6,6 +6,7 @@ Every stage passes blocks on as they come, so that nothing is ever in memory as 
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,6 @@ import numpy as np
 
 from misstep.errors import MisstepError
 from misstep.formats import Block, Ending, Episode, Format, Header, read_episodes
-from misstep.formats.guard import prefixed
 from misstep.parameters import ParameterValue
 from misstep.recordings.angles import Convention, with_angles
 from misstep.recordings.clock import on_one_clock
@@ -79,10 +79,14 @@ class Plan:
     def __post_init__(self) -> None:
         if self.parameters and not self.system:
             raise MisstepError("parameters belong to a system: name it with --system")
-        way = self.infer_actions.partition(":")[0]
+        way, colon, _ = self.infer_actions.partition(":")
         if way not in ("", INVERSE_DYNAMICS, VELOCITIES):
             raise MisstepError(
                 f"--infer-actions {way!r}: there are {INVERSE_DYNAMICS} and {VELOCITIES}"
+            )
+        if colon and way != VELOCITIES:
+            raise MisstepError(
+                f"--infer-actions {self.infer_actions!r}: only {VELOCITIES} are of some columns"
             )
         if way == INVERSE_DYNAMICS and not self.system:
             raise MisstepError(
@@ -195,8 +199,34 @@ def planned(
 
         options = replace(plan.mapping.options(), only=plan.only, report=report_one)
         for episode in read_episodes(path, options, format):
-            with prefixed(str(path)):
-                yield plan.apply(episode, system, beginnings)
+            with _naming(path):
+                made = plan.apply(episode, system, beginnings)
+            yield _with_file(path, made)
+
+
+def _with_file(path: Path, episode: Episode) -> Episode:
+    """Return the episode; what is found wrong with it on its way is told with its file."""
+
+    def blocks() -> Iterator[Block]:
+        with _naming(path):
+            yield from episode.blocks
+
+    def ending() -> Ending:
+        with _naming(path):
+            return episode.ending()
+
+    return replace(episode, blocks=blocks(), ending=ending)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Let an error begin with the file, unless it names it, as those of its reader do."""
+    try:
+        yield
+    except MisstepError as error:
+        if str(path) in str(error):
+            raise
+        raise MisstepError(f"{path}: {error}") from error
 
 
 def losing(episodes: Iterator[Episode], target: Format, *, allowed: bool) -> Iterator[Episode]:

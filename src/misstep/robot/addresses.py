@@ -1,5 +1,6 @@
 """Where a service listens: ``127.0.0.1:7106``, ``unix:/run/user/1000/misstep``, ``ws://…``."""
 
+import errno
 import socket
 from pathlib import Path
 
@@ -23,7 +24,8 @@ def parse_address(address: str) -> tuple[str, int] | str:
     if address.startswith(UNIX) and len(address) > len(UNIX):
         return address.removeprefix(UNIX)
     host, _, port = address.rpartition(":")
-    if not host or not (port.isascii() and port.isdigit()) or int(port) > 65535:
+    is_port = port.isascii() and port.isdigit() and len(port) <= 5 and int(port) <= 65535
+    if not host or not is_port:
         raise MisstepError(
             f"the address {address!r} is neither host:port, such as {LOOPBACK}:7106, nor {UNIX}PATH"
         )
@@ -43,8 +45,8 @@ def connect_socket(address: str, timeout: float) -> socket.socket:
         if isinstance(where, str):
             return _connect_unix(where, timeout)
         connection = socket.create_connection(where, timeout=timeout)
-    except OSError as error:
-        raise MisstepError(f"nobody answers at {address}: {error.strerror or error}") from error
+    except (OSError, UnicodeError) as error:
+        raise MisstepError(f"nobody answers at {address}: {_reason(error)}") from error
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return connection
 
@@ -62,9 +64,14 @@ def listen(address: str) -> tuple[socket.socket, str]:
         if isinstance(where, str):
             return _listen_unix(where), address
         listener = socket.create_server(where)
-    except OSError as error:
-        raise MisstepError(f"cannot listen at {address}: {error.strerror or error}") from error
+    except (OSError, UnicodeError) as error:
+        raise MisstepError(f"cannot listen at {address}: {_reason(error)}") from error
     return listener, f"{where[0]}:{listener.getsockname()[1]}"
+
+
+def _reason(error: OSError | UnicodeError) -> str:
+    """Return why there is no connection; a host that can be no name is a UnicodeError."""
+    return getattr(error, "strerror", None) or str(error)
 
 
 def _connect_unix(path: str, timeout: float) -> socket.socket:
@@ -82,11 +89,17 @@ def _listen_unix(path: str) -> socket.socket:
     """Listen at a path that the owner alone can reach, also where a killed service left one."""
     if Path(path).is_socket():
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-            if probe.connect_ex(path) == 0:
-                raise MisstepError(f"a service listens at {UNIX}{path} already")
-        Path(path).unlink()
+            answer = probe.connect_ex(path)
+        if answer == 0:
+            raise MisstepError(f"a service listens at {UNIX}{path} already")
+        if answer == errno.ECONNREFUSED:  # nobody listens any more
+            Path(path).unlink()
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    listener.bind(path)
-    Path(path).chmod(0o600)
-    listener.listen()
+    try:
+        listener.bind(path)
+        Path(path).chmod(0o600)
+        listener.listen()
+    except OSError:
+        listener.close()
+        raise
     return listener

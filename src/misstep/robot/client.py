@@ -60,7 +60,7 @@ class RobotClient:
     Raises
     ------
     MisstepError
-        If nobody answers, or the service refuses.
+        If nobody answers, the service refuses, or it is no exploration service.
     """
 
     def __init__(
@@ -83,6 +83,8 @@ class RobotClient:
         }
         try:
             self.description = self._ask_json(encode(Kind.HELLO, hello), Kind.WELCOME)
+            if "watchdog" not in self.description:
+                raise MisstepError(f"{address}: a robot answers, and no exploration service")
         except MisstepError:
             self._link.close()
             raise

@@ -83,7 +83,8 @@ class Limits:
     def __post_init__(self) -> None:
         columns = zip(self.action_columns, self.low, self.high, strict=True)
         for i, (column, low, high) in enumerate(columns):
-            if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            # Twice the range is reckoned with, and has to be a number too.
+            if not (math.isfinite(2.0 * (high - low)) and low < high):
                 raise MisstepError(
                     f"action {column.name} goes from {low:g} to {high:g} {column.unit}: a robot "
                     "needs finite limits, the smaller first"
@@ -135,6 +136,11 @@ class Limits:
             if not least < most:
                 raise MisstepError(f"the range of {name} is {least:g} .. {most:g}: it is empty")
             i = names.index(name)
+            if not (least < high[i] and most > low[i]):
+                raise MisstepError(
+                    f"the range of {name} is {least:g} .. {most:g}: outside {low[i]:g} .. "
+                    f"{high[i]:g}, so that every state would be refused"
+                )
             low[i], high[i] = max(low[i], least), min(high[i], most)
         m = len(system.action_columns)
         return cls(

@@ -67,18 +67,20 @@ class _SocketLink:
 class _WebSocketLink:
     def __init__(self, address: str, timeout: float) -> None:
         try:
-            from websockets.exceptions import ConnectionClosed, InvalidHandshake
+            from websockets.exceptions import ConnectionClosed, WebSocketException
             from websockets.sync.client import connect
         except ImportError as error:
             raise MisstepError(
                 "WebSockets need the package websockets: pip install 'misstep[live]'"
             ) from error
+        # The library wants a context, from version 17.1 on.
         self._closed, self._open = ConnectionClosed, ExitStack()
         options: dict[str, Any] = {"max_size": LONGEST, "open_timeout": timeout, "close_timeout": 1}
         try:
-            connecting: Any = connect(address, compression=None, **options)
+            # Straight there: no proxy for web pages is to see what a robot is told.
+            connecting: Any = connect(address, compression=None, proxy=None, **options)
             self._connection = self._open.enter_context(connecting)
-        except (OSError, InvalidHandshake) as error:
+        except (OSError, ValueError, WebSocketException) as error:  # ValueError: no such port
             raise MisstepError(f"nobody answers at {address}: {error}") from error
 
     def send(self, message: bytes) -> None:

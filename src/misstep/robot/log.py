@@ -39,6 +39,7 @@ _COMMAND, _EVENT = 1, 2
 _TIME = struct.Struct("<d")
 _LONGEST_TEXT = 2000
 _LONGEST_RECORD = _HEAD.size + 2**16
+_MOST_NUMBERS = 2**16 // 8
 _NO_SEQUENCE = 2**64 - 1
 _WINDOW = 2**18
 """Bytes that are mapped; the next are reserved when half of them are full."""
@@ -98,7 +99,7 @@ class ActionLog:
     def __init__(self, path: str | os.PathLike[str], header: Mapping[str, Any]) -> None:
         self.path = Path(path)
         n, m = header["n_observations"], header["n_actions"]
-        record = struct.Struct(f"<HQd{n + 2 * m}d")
+        record = _command_layout(n, m)
         self._pack, self._length = record.pack_into, record.size
         self._command_head = _HEAD.pack(_COMMAND, 0, record.size)
         self._unknown = (float("nan"),) * n
@@ -106,10 +107,13 @@ class ActionLog:
         text = json.dumps(header).encode()
         start = _MAGIC + struct.pack("<I", len(text)) + text
         try:
-            flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
-            self._file = os.open(self.path, flags, 0o644)
-            os.write(self._file, start)
-            self._map(len(start))
+            self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
+            try:
+                os.write(self._file, start)
+                self._map(len(start))
+            except OSError:
+                os.close(self._file)
+                raise
         except OSError as error:
             raise MisstepError(f"cannot write the log {path}: {error.strerror}") from error
 
@@ -150,7 +154,7 @@ class ActionLog:
 
     def event(self, time: float, text: str) -> None:
         """Append a line of text; raise OSError where there is no room left."""
-        line = _TIME.pack(time) + text.encode()[:_LONGEST_TEXT]
+        line = _TIME.pack(time) + text.encode(errors="replace")[:_LONGEST_TEXT]
         start = self._at + _HEAD.size
         end = start + len(line)
         if end > _WINDOW:
@@ -224,16 +228,23 @@ def read_log(path: str | os.PathLike[str]) -> tuple[dict[str, Any], Iterator[Sen
         (length,) = struct.unpack_from("<I", data, len(_MAGIC))
         start = len(_MAGIC) + 4
         header = json.loads(data[start : start + length])
-        n, m = int(header["n_observations"]), int(header["n_actions"])
-    except (ValueError, KeyError, TypeError, struct.error) as error:
+        n, m = header["n_observations"], header["n_actions"]
+        if not (type(n) is type(m) is int and min(n, m) >= 0 and n + 2 * m <= _MOST_NUMBERS):
+            raise ValueError(f"it says that a record holds {n} + 2 × {m} numbers")
+    except (ValueError, KeyError, TypeError, RecursionError, struct.error) as error:
         raise MisstepError(f"{path} is not a log of a service: {error}") from error
     return header, _records(data, start + length, n, m, path)
+
+
+def _command_layout(n: int, m: int) -> struct.Struct:
+    """Return the layout of what follows the head of a command; see the module."""
+    return struct.Struct(f"<HQd{n + 2 * m}d")
 
 
 def _records(
     data: mmap.mmap, at: int, n: int, m: int, path: str | os.PathLike[str]
 ) -> Iterator[Sent | Event]:
-    layout = struct.Struct(f"<HQd{n + 2 * m}d")
+    layout = _command_layout(n, m)
     while at + _HEAD.size <= len(data):
         kind, zero, length = _HEAD.unpack_from(data, at)
         if kind == zero == length == 0 and not any(data[at + _LONGEST_RECORD :]):
@@ -255,5 +266,5 @@ def _records(
             text = data[at + _TIME.size : at + length].decode(errors="replace")
             yield Event(_TIME.unpack_from(data, at)[0], text)
         else:
-            raise MisstepError(f"{path} is damaged at byte {at}: no such record")
+            raise MisstepError(f"{path} is damaged at byte {at - _HEAD.size}: no such record")
         at += length

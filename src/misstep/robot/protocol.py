@@ -32,6 +32,7 @@ Flags of a STATE: 1 failed, 2 succeeded, 4 over. Of an OBSERVED: 1 failed, 2 suc
 8 truncated, 16 timed out.
 """
 
+import hmac
 import json
 import math
 import struct
@@ -114,6 +115,27 @@ def decode(message: bytes) -> dict[str, Any]:
     if not isinstance(body, dict):
         raise MisstepError("a message holds JSON that is no object")
     return body
+
+
+def read_hello(message: bytes, token: str, we: str) -> dict[str, Any]:
+    """Return what a client says of itself in its first message to us, a service or a robot.
+
+    Raises
+    ------
+    MisstepError
+        If it is no HELLO, or has another token or version.
+    """
+    if kind_of(message) != Kind.HELLO:
+        raise MisstepError("the first message has to be a HELLO")
+    hello = decode(message)
+    given = hello.get("token")
+    # A text of JSON can hold half a character, which is no UTF-8.
+    ours, theirs = (str(text).encode("utf-8", "surrogatepass") for text in (token, given))
+    if not isinstance(given, str) or not hmac.compare_digest(ours, theirs):
+        raise MisstepError("the token is not the right one")
+    if hello.get("version") != VERSION:
+        raise MisstepError(f"this {we} speaks version {VERSION} of the protocol")
+    return hello
 
 
 def encode_state(state: State) -> bytes:

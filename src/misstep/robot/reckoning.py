@@ -24,7 +24,7 @@ from numba import njit
 from numba.types import boolean, float64, int64, void
 from numpy.typing import NDArray
 
-from misstep.robot.limiter import ROWS, move, table_of
+from misstep.robot.limiter import ROWS, WANTED, move, table_of
 from misstep.robot.limits import Limits
 
 Vector = NDArray[np.float64]
@@ -158,7 +158,7 @@ def follow(v: Vector, now: float) -> int:
     """
     m = int(v[_M])
     table = v[_HEAD : _HEAD + ROWS * m].reshape((ROWS, m))
-    for value in table[ROWS - 1]:
+    for value in table[WANTED]:
         if not math.isfinite(value):
             return NO_ACTION
     advance(v, now)

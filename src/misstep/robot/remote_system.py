@@ -153,6 +153,8 @@ class RemoteSystem(System):
             told = decode(reply)
             if kind_of(reply) != Kind.WELCOME:
                 raise MisstepError(f"{self._address}: {told.get('error', 'no robot answers')}")
+            if "observations" not in told:
+                raise MisstepError(f"{self._address}: an exploration service answers, and no robot")
         except OSError as error:
             link.close()
             raise MisstepError(f"{self._address}: no answer: {error}") from error
@@ -168,17 +170,21 @@ class RemoteSystem(System):
         deadline = time.monotonic() + self._patience
         try:
             link.send(message)
-            reply = link.receive(remaining(deadline))
+            return self._observed(link.receive(remaining(deadline)))
         except OSError as error:
             self.close()
             raise MisstepError(f"{self._address}: the robot is gone: {error}") from error
-        if kind_of(reply) != Kind.OBSERVED:
+        except MisstepError:
             self.close()
+            raise
+
+    def _observed(self, reply: bytes) -> Observed:
+        """Return what an answer tells, or raise MisstepError."""
+        if kind_of(reply) != Kind.OBSERVED:
             raise MisstepError(f"{self._address}: {decode(reply).get('error')}")
         observed = decode_observed(reply)
         values = (*observed.observation, observed.reward)
         if len(values) != len(self.observation_columns) + 1 or not all(map(math.isfinite, values)):
-            self.close()
             raise MisstepError(f"{self._address}: the robot observes {observed.observation}")
         return observed
 
@@ -225,4 +231,8 @@ def _box(low: str, high: str, n: int, prefix: str) -> Any:
         if len(row) != n or any(value != value for value in row):
             raise MisstepError(f"remote: {prefix}{name} is {text!r}: write {n} numbers")
         rows.append(np.array(row))
+    if not np.all(rows[0] <= rows[1]):
+        raise MisstepError(
+            f"remote: {prefix}low is {low!r} and {prefix}high is {high!r}: write the smaller first"
+        )
     return gymnasium.spaces.Box(rows[0], rows[1], dtype=np.float64)

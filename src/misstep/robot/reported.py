@@ -101,7 +101,7 @@ class ReportedTrial:
         self._take = self._judge if judges else self._believe
         self._has_cost = "cost" in judges
         self._observations = np.zeros((n_steps + 1, len(system.observation_columns)))
-        self._actions, self._costs = array("d"), np.zeros(n_steps)
+        self._actions, self._costs = array("d"), np.zeros(n_steps)  # row by row
         self._m = len(system.action_columns)
         self._n_observations = 0
         self._n_steps = n_steps
@@ -164,16 +164,13 @@ class ReportedTrial:
         if t == 0:
             _, info = self._system.reset()
         else:
-            _, reward, terminated, truncated, info = self._system.step(self._sent(t)[t - 1])
+            action = np.array(self._actions[(t - 1) * self._m : t * self._m])
+            _, reward, terminated, truncated, info = self._system.step(action)
             self._costs[t - 1] = -float(reward)
             self._costs_known &= self._has_cost or state.cost is not None
             self.over = terminated or truncated
             self._success = bool(info["success"])
         return bool(info["failed"])
-
-    def _sent(self, n: int) -> NDArray[np.float64]:
-        """Return the first `n` actions, (n, m)."""
-        return np.array(self._actions[: n * self._m]).reshape(n, self._m)
 
     def trajectory(self) -> Trajectory:
         """Return the trial, at least one step long."""
@@ -184,7 +181,7 @@ class ReportedTrial:
             outcome = Outcome.SUCCESS if self._success else Outcome.UNKNOWN
         return Trajectory(
             observations=self._observations[: n + 1],
-            actions=self._sent(n),
+            actions=np.array(self._actions[: n * self._m]).reshape(n, self._m),
             dt=self._reported.dt,
             observation_columns=self._reported.observation_columns,
             action_columns=self._reported.action_columns,

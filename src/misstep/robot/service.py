@@ -34,9 +34,11 @@ from misstep.robot.cadence import Cadence
 from misstep.robot.guard import Command, Guard, Safety, State
 from misstep.robot.limits import Limits, Reason, Row
 from misstep.robot.log import ActionLog
+from misstep.robot.numbering import next_number
 from misstep.robot.reported import ReportedTrial
 from misstep.rollout import Policy, utc_now
-from misstep.runs import Run, make_folder
+from misstep.runs import Run
+from misstep.storage import make_folder
 from misstep.systems import System
 from misstep.trajectory import Dataset, Outcome, Trajectory
 
@@ -140,7 +142,7 @@ class ExplorationService:
         self._simulated, self._stamp = simulated_time, 0.0
         self._now: Clock = self._last_stamp if simulated_time else clock
         self._learning, self._on_trial = learning, on_trial
-        self._n_driven = len(list(run.folder.glob(f"{DRIVEN}/trial_*.h5"))) if run.folder else 0
+        self._n_driven = next_number(run.folder / DRIVEN, "trial_*.h5") if run.folder else 0
         self._task = Task.of(self._system, run.config.state)
         self.cadence = Cadence()
         self.unlogged = 0
@@ -298,7 +300,8 @@ class ExplorationService:
         """
         with self._lock:
             now = self._now()
-            self._watch(now)
+            if self._guard.is_silent(now):
+                self._give_up()
             under_way = self._trial is not None and self._trial.is_under_way
             # In simulated time nothing moves between states, but a stop is a stop.
             stands = self._simulated and not self._guard.stopped
@@ -379,10 +382,6 @@ class ExplorationService:
     def _last_stamp(self) -> float:
         return self._stamp
 
-    def _watch(self, now: float) -> None:
-        if self._guard.is_silent(now):
-            self._give_up()
-
     def _give_up(self) -> None:
         self._abandon("watchdog: no fresh state", Reason.WATCHDOG)
 
@@ -438,9 +437,8 @@ class ExplorationService:
             return None
         folder = self.run.folder / LOGS
         make_folder(folder)
-        number = sum(1 for _ in folder.glob("*.log"))
         header = {**self.describe(), "time": utc_now(), "clock": self._now()}
-        return ActionLog(folder / f"{number:04d}.log", header)
+        return ActionLog(folder / f"{next_number(folder, '*.log'):04d}.log", header)
 
     def _send(self, command: Command, now: float, observation: Row | None) -> Command:
         """Log a command and return it; where the disk is full, an emergency stop instead."""
@@ -502,7 +500,7 @@ class ExplorationService:
         return Proposal(self.run.policy, int(stream.generate_state(1)[0]), demonstrator, 0.0)
 
     def _n_kept(self) -> int:
-        """Return how many trials have been kept: the number of the next one."""
+        """Return the number of the next trial: how many have been kept, unless some are gone."""
         return len(self.run.trials) if self._learning else self._n_driven
 
 
@@ -517,7 +515,7 @@ def _n_steps(system: System, duration: float) -> int:
 
 
 def _or_none(value: float) -> float | None:
-    return None if value == float("inf") else value
+    return None if value == math.inf else value
 
 
 def _microseconds(seconds: float | None) -> float | None:

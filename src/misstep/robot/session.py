@@ -5,8 +5,9 @@ looks after the watchdog. A `Session` is one client's conversation; a transport 
 messages that come in and a function that sends one.
 """
 
-import hmac
 import logging
+import socket
+import struct
 import threading
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -14,13 +15,13 @@ from typing import Any, Protocol
 from misstep.errors import MisstepError
 from misstep.robot.guard import Command
 from misstep.robot.protocol import (
-    VERSION,
     Kind,
     decode,
     decode_state,
     encode,
     encode_command,
     kind_of,
+    read_hello,
 )
 from misstep.robot.service import ExplorationService, Phase
 from misstep.trajectory import Outcome
@@ -29,6 +30,14 @@ Send = Callable[[bytes], None]
 """Sends a message; raises OSError where the client is gone."""
 
 MOST_CLIENTS = 16
+HELLO_TIMEOUT = 5.0
+"""Seconds that a transport waits for the first message of a client."""
+_SEND_TIMEOUT = struct.pack("@ll", 1, 0)  # a timeval of 1 s
+
+
+def limit_sending(connection: socket.socket) -> None:
+    """Have `send` raise OSError after 1 s: who does not read is let go, and holds nobody up."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _SEND_TIMEOUT)
 
 
 class Conversation(Protocol):
@@ -65,11 +74,11 @@ class Hub:
     Attributes
     ----------
     service : ExplorationService
+    token : str
     """
 
     def __init__(self, service: ExplorationService, token: str) -> None:
-        self.service = service
-        self._token = token.encode()
+        self.service, self.token = service, token
         self._lock = threading.Lock()
         self._sessions: set[Session] = set()
         self._driver: Session | None = None
@@ -101,11 +110,6 @@ class Hub:
                 self._driver = None
         if drove:
             self.service.disconnect(session.name)
-
-    def knows(self, token: object) -> bool:
-        """Return whether a client's token is the right one."""
-        given = token.encode() if isinstance(token, str) else b""
-        return hmac.compare_digest(given, self._token)
 
     def take_wheel(self, session: "Session") -> None:
         """Let a client drive, in place of one that is not in a trial.
@@ -213,7 +217,7 @@ class Session:
 
     def _answer(self, kind: int, message: bytes) -> None:
         if not self._welcome:
-            self._greet(kind, message)
+            self._greet(message)
             return
         service = self._service
         if kind == Kind.START:
@@ -231,14 +235,8 @@ class Session:
             raise MisstepError(f"a message of kind {kind} says nothing here")
         self._say(encode(Kind.REPORT, service.status()))
 
-    def _greet(self, kind: int, message: bytes) -> None:
-        if kind != Kind.HELLO:
-            raise MisstepError("the first message has to be a HELLO")
-        hello = decode(message)
-        if not self._hub.knows(hello.get("token")):
-            raise MisstepError("the token is not the right one")
-        if hello.get("version") != VERSION:
-            raise MisstepError(f"this service speaks version {VERSION} of the protocol")
+    def _greet(self, message: bytes) -> None:
+        hello = read_hello(message, self._hub.token, "service")
         name = hello.get("name")
         if isinstance(name, str) and name.isprintable():
             self.name = name[:_LONGEST_NAME]

@@ -2,7 +2,6 @@
 
 import logging
 import socket
-import struct
 import threading
 from contextlib import suppress
 from pathlib import Path
@@ -11,11 +10,10 @@ from misstep.errors import MisstepError
 from misstep.robot.addresses import UNIX, listen, parse_address
 from misstep.robot.frames import FrameStream
 from misstep.robot.protocol import Kind, encode
-from misstep.robot.session import Host
+from misstep.robot.session import HELLO_TIMEOUT, Host, limit_sending
 
 _LOG = logging.getLogger(__name__)
-_HELLO_TIMEOUT = 5.0  # s
-_SEND_TIMEOUT = struct.pack("@ll", 1, 0)  # a timeval of 1 s: who does not read is let go
+_PAUSE = 0.1  # s after a client could not be let in, as where there are too many open files
 
 
 class SocketServer:
@@ -43,13 +41,13 @@ class SocketServer:
         self._listener, self.address = listen(address)
         self._streams: set[FrameStream] = set()
         self._lock = threading.Lock()
-        self._closing = False
+        self._closing = threading.Event()
         self._thread = threading.Thread(target=self._accept, name="listener", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Hang up on every client and stop listening."""
-        self._closing = True
+        self._closing.set()
         with suppress(OSError):  # on some systems a listener cannot be shut down
             self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
@@ -63,23 +61,25 @@ class SocketServer:
             Path(where).unlink(missing_ok=True)
 
     def _accept(self) -> None:
-        while not self._closing:
+        while not self._closing.is_set():
             try:
                 connection, _ = self._listener.accept()
             except OSError as error:
-                if not self._closing:
+                if not self._closing.is_set():
                     _LOG.warning("a client could not be let in: %s", error)
+                self._closing.wait(_PAUSE)
                 continue
-            threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
+            # Before its thread is there: `close` has to find it.
+            stream = FrameStream(connection)
+            with self._lock:
+                self._streams.add(stream)
+            threading.Thread(target=self._serve, args=(connection, stream), daemon=True).start()
 
-    def _serve(self, connection: socket.socket) -> None:
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _SEND_TIMEOUT)
-        if not self.address.startswith(UNIX):
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        stream = FrameStream(connection)
-        with self._lock:
-            self._streams.add(stream)
+    def _serve(self, connection: socket.socket, stream: FrameStream) -> None:
         try:
+            limit_sending(connection)
+            if not self.address.startswith(UNIX):
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._converse(stream)
         except OSError as error:
             _LOG.info("a client is lost: %s", error)
@@ -95,7 +95,7 @@ class SocketServer:
             stream.send(encode(Kind.REFUSED, {"error": str(error)}))
             return
         try:
-            stream.settimeout(_HELLO_TIMEOUT)
+            stream.settimeout(HELLO_TIMEOUT)
             message = stream.receive()
             stream.settimeout(None)
             while message is not None and session.receive(message):

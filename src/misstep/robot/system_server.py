@@ -5,7 +5,6 @@ gone, or says nothing for too long in an episode, the system is stepped towards 
 until it is there, and the episode is over.
 """
 
-import hmac
 import logging
 import threading
 import time
@@ -17,7 +16,6 @@ from misstep.errors import MisstepError
 from misstep.robot.limiter import Limiter
 from misstep.robot.limits import Limits, Row
 from misstep.robot.protocol import (
-    VERSION,
     Kind,
     Observed,
     decode,
@@ -25,14 +23,15 @@ from misstep.robot.protocol import (
     encode,
     encode_observed,
     kind_of,
+    read_hello,
 )
 from misstep.robot.remote_system import describe_system
 from misstep.robot.service import Clock
-from misstep.robot.session import Send
+from misstep.robot.session import MOST_CLIENTS, Send
 from misstep.systems import System
 
 _LOG = logging.getLogger(__name__)
-_NEAR = 1e-9
+_NEAR = 1e-9  # of the action's unit
 _MOST_STEPS_TO_SAFE = 10_000
 
 
@@ -67,11 +66,13 @@ class SystemHub:
         watchdog: float = 0.5,
         clock: Clock = time.monotonic,
     ) -> None:
-        self._system, self._token, self._watchdog = system, token.encode(), watchdog
+        self._system, self._token, self._watchdog = system, token, watchdog
         self._clock = clock
         self._limits = Limits.of(system) if limits is None else limits
         self._limiter = Limiter(self._limits)
         self._lock = threading.Lock()
+        self._door = threading.Lock()
+        self._sessions: set[_SystemSession] = set()
         self._driver: _SystemSession | None = None
         self._in_episode = False
         self._stepped_at: float | None = None
@@ -80,11 +81,18 @@ class SystemHub:
         self._thread.start()
 
     def open(self, send: Send) -> "_SystemSession":
-        """Return the conversation of a new client."""
-        return _SystemSession(self, send)
+        """Return the conversation of a new client; MisstepError if there are too many."""
+        session = _SystemSession(self, send)
+        with self._door:
+            if len(self._sessions) >= MOST_CLIENTS:
+                raise MisstepError(f"there are {MOST_CLIENTS} clients already")
+            self._sessions.add(session)
+        return session
 
     def forget(self, session: "_SystemSession") -> None:
         """Let a client go; its episode is over."""
+        with self._door:
+            self._sessions.discard(session)
         with self._lock:
             if self._driver is session:
                 self._driver = None
@@ -97,14 +105,9 @@ class SystemHub:
         with self._lock:
             self._retreat("the end")
 
-    def greet(self, session: "_SystemSession", hello: dict[str, Any]) -> dict[str, Any]:
+    def greet(self, session: "_SystemSession", message: bytes) -> dict[str, Any]:
         """Let a client drive and return the description of the system, or raise MisstepError."""
-        given = hello.get("token")
-        known = given.encode() if isinstance(given, str) else b""
-        if not hmac.compare_digest(known, self._token):
-            raise MisstepError("the token is not the right one")
-        if hello.get("version") != VERSION:
-            raise MisstepError(f"this robot speaks version {VERSION} of the protocol")
+        read_hello(message, self._token, "robot")
         with self._lock:
             if self._driver is not None:
                 raise MisstepError("another client drives")
@@ -148,22 +151,25 @@ class SystemHub:
             return
         _LOG.warning("to the safe action: %s", why)
         safe = self._limits.safe
-        for _ in range(_MOST_STEPS_TO_SAFE):
-            self._apply(safe)
-            if not self._in_episode or np.allclose(self._limiter.action, safe, rtol=0, atol=_NEAR):
-                break
-        self._in_episode = False
+        try:
+            for _ in range(_MOST_STEPS_TO_SAFE):
+                self._apply(safe)
+                is_safe = np.allclose(self._limiter.action, safe, rtol=0, atol=_NEAR)
+                if is_safe or not self._in_episode:
+                    break
+        finally:
+            self._in_episode = False
 
     def _watch_on(self) -> None:
         while not self._closing.wait(self._limits.period):
             with self._lock:
                 since = self._stepped_at
-                if (
-                    self._in_episode
-                    and since is not None
-                    and self._clock() - since > self._watchdog
-                ):
+                if since is None or self._clock() - since <= self._watchdog:
+                    continue
+                try:
                     self._retreat("nothing was heard for too long")
+                except Exception:  # whatever the robot raises: the next episode is watched too
+                    _LOG.exception("the robot could not be brought to its safe action")
 
 
 class _SystemSession:
@@ -189,9 +195,7 @@ class _SystemSession:
     def _answer(self, message: bytes) -> bytes:
         kind = kind_of(message)
         if not self._welcome:
-            if kind != Kind.HELLO:
-                raise MisstepError("the first message has to be a HELLO")
-            description = self._hub.greet(self, decode(message))
+            description = self._hub.greet(self, message)
             self._welcome = True
             return encode(Kind.WELCOME, description)
         if kind == Kind.STEP:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from misstep.errors import MisstepError
 from misstep.robot.addresses import WEB, listen
 from misstep.robot.protocol import LONGEST
-from misstep.robot.session import Host
+from misstep.robot.session import HELLO_TIMEOUT, Host, limit_sending
 
 _LOG = logging.getLogger(__name__)
 
@@ -65,16 +65,17 @@ class WebSocketServer:
             except self._closed as error:
                 raise ConnectionError(str(error)) from error
 
+        limit_sending(connection.socket)
         try:
             session = self._hub.open(send)
         except MisstepError as error:
             connection.close(1013, str(error)[:100])
             return
         try:
-            for message in connection:
-                if isinstance(message, str) or not session.receive(message):
-                    break
-        except OSError as error:
+            message = connection.recv(HELLO_TIMEOUT)
+            while isinstance(message, bytes) and session.receive(message):
+                message = connection.recv()
+        except (OSError, self._closed) as error:
             _LOG.info("a client is lost: %s", error)
         finally:
             session.close()

@@ -7,7 +7,7 @@ compared on the same demonstrations.
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import quote
@@ -18,7 +18,8 @@ from threadpoolctl import threadpool_limits
 from misstep.demonstrators import demonstrate
 from misstep.errors import MisstepError
 from misstep.learning import evaluate, learn
-from misstep.runs import Run, read_json
+from misstep.runs import Run
+from misstep.storage import read_json
 from misstep.study.spec import Cell
 from misstep.systems import make_system
 from misstep.systems.rendering import write_video
@@ -30,12 +31,23 @@ WIDTH, HEIGHT, FPS = 480, 270, 15.0
 
 
 @dataclass(frozen=True)
+class Timing:
+    """How long a cell took; differs from one time to the next."""
+
+    computing_seconds: float
+    """Of learning alone, without the trials, s."""
+    wall_seconds: float
+    """Of the whole cell, s."""
+
+
+@dataclass(frozen=True)
 class CellResult:
     """What came of a cell. All but `Timing` is the same on every machine of a kind."""
 
     status: Status
     error: str = ""
     trials_to_success: int | None = None
+    """None without a success, and where the cell ended in an error."""
     seconds_of_interaction: float = 0.0
     """Duration of all trials together, s; up to and including the first success."""
     outcomes: tuple[str, ...] = ()
@@ -46,7 +58,7 @@ class CellResult:
     tests: int = 0
     survived: int | None = None
     """Successes of the final policy in `tests` other starts; None if it was not tested."""
-    timing: "Timing" = field(default_factory=lambda: Timing(0.0, 0.0))
+    timing: Timing = Timing(0.0, 0.0)
 
     @classmethod
     def load(cls, path: Path) -> "CellResult":
@@ -59,10 +71,14 @@ class CellResult:
         """
         values = read_json(path)
         names = set(cls.__dataclass_fields__)
+        damaged = MisstepError(f"{path} is no result of a study: delete it, and it is made again")
         if not isinstance(values, dict) or set(values) != {"cell", *names}:
-            raise MisstepError(f"{path} is no result of a study: delete it, and it is made again")
-        lists = {name: tuple(values[name]) for name in ("outcomes", "failure_times", "costs")}
-        timing = Timing(**values["timing"])
+            raise damaged
+        try:
+            lists = {name: tuple(values[name]) for name in ("outcomes", "failure_times", "costs")}
+            timing = Timing(**values["timing"])
+        except TypeError as error:
+            raise damaged from error
         return cls(**{name: values[name] for name in names} | lists | {"timing": timing})
 
     @property
@@ -77,16 +93,6 @@ class CellResult:
     def to_json(self) -> dict[str, Any]:
         """Return it as plain values."""
         return asdict(self)
-
-
-@dataclass(frozen=True)
-class Timing:
-    """How long a cell took; differs from one time to the next."""
-
-    computing_seconds: float
-    """Of learning alone, without the trials, s."""
-    wall_seconds: float
-    """Of the whole cell, s."""
 
 
 def cell_file(out: Path, cell: Cell) -> Path:
@@ -115,7 +121,7 @@ def run_cell(cell: Cell) -> CellResult:
     return CellResult(
         status="error" if error else "done",
         error=error,
-        trials_to_success=runs[-1].trials_to_success if runs else None,
+        trials_to_success=None if error else runs[-1].trials_to_success,
         seconds_of_interaction=sum(trial.duration for trial in trials),
         outcomes=tuple(str(trial.outcome) for trial in trials),
         failure_times=tuple(trial.failure_time for trial in trials),

@@ -11,8 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from misstep.plots import FAINT, INK, SERIES, style
-from misstep.runs import make_folder
-from misstep.storage import atomic_write
+from misstep.storage import atomic_write, make_folder
 from misstep.study.table import Measured
 
 _WIDTH = 9.6

@@ -20,14 +20,13 @@ from functools import partial
 from pathlib import Path
 
 from misstep.errors import MisstepError
-from misstep.runs import make_folder, read_json
-from misstep.storage import write_json, write_text
+from misstep.storage import make_folder, read_json, write_json, write_text
 from misstep.study import figures, markdown, page, table
 from misstep.study.cells import CellResult, Video, cell_file, run_cell, write_first_success
 from misstep.study.ray_engine import check_ray, run_on_ray
 from misstep.study.spec import Cell, Study
 from misstep.version import __version__, command_line
-from misstep.workers import Lost, Progress, check_workers, run_in_processes, silent
+from misstep.workers import Lost, Progress, Tally, check_workers, run_in_processes, silent
 
 CONFIG = "study.json"
 ENGINES = ("processes", "ray")
@@ -84,22 +83,22 @@ def run_study(
     Raises
     ------
     MisstepError
-        If the folder cannot be used or holds another study, there is no such engine, or Ray is
-        not installed or not reached.
+        If `workers` is below 1, the folder cannot be used or holds another study, there is no
+        such engine, or Ray is not installed or not reached.
     """
-    run = _engine(engine, workers, address)
     processes = check_workers(workers)
+    run = _engine(engine, workers, address)
     _claim(out, study)
     missing = [cell for cell in study.cells if not _is_done(out, cell)]
-    steps = _Steps(progress or silent, len(study.cells))
-    steps.done = len(study.cells) - len(missing)
+    total = len(study.cells)
+    tally = Tally(progress or silent, total, done=total - len(missing))
     for cell, result in run(missing) if missing else ():
         if isinstance(result, Lost):
             result = CellResult("lost", f"lost: {result.reason}", tests=cell.tests)
         _save(out, cell, result)
-        steps.count(f"{cell.title}: {result.summary}")
+        tally.count(f"{cell.title}: {result.summary}")
     measured = [table.Measured(cell, CellResult.load(cell_file(out, cell))) for cell in study.cells]
-    return _write(out, study, measured, processes, steps)
+    return _write(out, study, measured, processes, tally)
 
 
 def held_study(out: Path) -> Study:
@@ -130,8 +129,6 @@ def _engine(name: str, workers: int | None, address: str | None) -> Engine:
             raise MisstepError("address is for the engine ray; processes run on this machine")
         return partial(run_in_processes, run_cell, workers=check_workers(workers))
     if name == "ray":
-        if workers is not None:
-            check_workers(workers)
         check_ray(address)
         return partial(run_on_ray, run_cell, workers=workers, address=address)
     raise MisstepError(f"no engine named {name!r}; there are: {', '.join(ENGINES)}")
@@ -192,13 +189,13 @@ def _save(out: Path, cell: Cell, result: CellResult) -> None:
 
 
 def _write(
-    out: Path, study: Study, measured: list[table.Measured], workers: int, steps: "_Steps"
+    out: Path, study: Study, measured: list[table.Measured], workers: int, tally: Tally
 ) -> Report:
     rows = table.summarise(measured)
     table.write_tables(out, measured, rows)
     write_text(out / "summary.md", markdown.short_table(measured))
     pictures = figures.draw_all(out / "figures", measured)
-    films = _film(out / "videos", measured, workers, steps) if study.videos else []
+    films = _film(out / "videos", measured, workers, tally) if study.videos else []
     target = out / "report.html"
     write_text(target, page.render(study, measured, rows, pictures, films))
     count = Counter(entry.result.status for entry in measured)
@@ -206,38 +203,24 @@ def _write(
 
 
 def _film(
-    folder: Path, measured: list[table.Measured], workers: int, steps: "_Steps"
+    folder: Path, measured: list[table.Measured], workers: int, tally: Tally
 ) -> list[page.Film]:
     """Write a video of the first success of every learner in every case, up to a number.
 
-    Variants of a case share one.
+    Variants of a case share one. A video bears the number of its cell, so that it is still the
+    right one when a cell before it, that was lost, has been made after all.
     """
     make_folder(folder)
-    first: dict[tuple[str, str], Cell] = {}
-    for cell, result in measured:
+    first: dict[tuple[str, str], Video] = {}
+    for number, (cell, result) in enumerate(measured, start=1):
         if result.trials_to_success is not None:
-            first.setdefault((cell.case.group, cell.learner.label), cell)
-    videos = [
-        Video(cell, folder / f"{number:02d}.mp4")
-        for number, cell in enumerate(list(first.values())[:MAX_VIDEOS], start=1)
-    ]
+            video = Video(cell, folder / f"{number:04d}.mp4")
+            first.setdefault((cell.case.group, cell.learner.label), video)
+    videos = list(first.values())[:MAX_VIDEOS]
     missing = [video for video in videos if not video.path.exists()]
-    steps.total += len(missing)
+    tally.total += len(missing)
     reasons: dict[Path, str] = {}
     for video, reason in run_in_processes(write_first_success, missing, workers):
         reasons[video.path] = reason.reason if isinstance(reason, Lost) else reason
-        steps.count(f"video of {video.cell.title}")
+        tally.count(f"video of {video.cell.title}")
     return [page.Film(video, reasons.get(video.path, "")) for video in videos]
-
-
-class _Steps:
-    """Counts what is done."""
-
-    def __init__(self, progress: Progress, total: int) -> None:
-        self.done = 0
-        self.total = total
-        self._progress = progress
-
-    def count(self, what: str) -> None:
-        self.done += 1
-        self._progress(self.done, self.total, what)

@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, ClassVar
 
@@ -15,7 +15,7 @@ from misstep.costs import StateCost
 from misstep.errors import MisstepError
 from misstep.parameters import ParameterValue, build_parameters, check_parameters, parameter
 from misstep.systems.mechanics import Mechanics
-from misstep.systems.system import System, compiled
+from misstep.systems.simulated import LONGEST_TIME, SHORTEST_STEP, Look, Simulated, substeps
 from misstep.trajectory import Column
 
 # The pole's inertia about its own axis, as a share of the one across it. The hinge never turns
@@ -55,9 +55,15 @@ class CartPoleParameters:
     force_limit: float = parameter(
         20.0, "N", "largest force on the cart, to either side", above=0, at_most=1e6
     )
-    control_rate: float = parameter(50.0, "Hz", "actions per second", above=0)
-    physics_step: float = parameter(0.01, "s", "longest step of the simulation", above=0)
-    duration: float = parameter(30.0, "s", "length of an episode that does not end early", above=0)
+    control_rate: float = parameter(
+        50.0, "Hz", "actions per second", at_least=1e-3, at_most=1 / SHORTEST_STEP
+    )
+    physics_step: float = parameter(
+        0.01, "s", "longest step of the simulation", at_least=SHORTEST_STEP
+    )
+    duration: float = parameter(
+        30.0, "s", "length of an episode that does not end early", above=0, at_most=LONGEST_TIME
+    )
     start_angle: float = parameter(0.0, "rad", "mean angle at the start")
     start_spread: float = parameter(
         0.05, "rad", "standard deviation of the angle at the start", at_least=0
@@ -78,7 +84,9 @@ class CartPoleParameters:
     upright_angle_deg: float = parameter(
         12.0, "deg", "the pole is upright within this angle", above=0, at_most=180
     )
-    delay: float = parameter(0.0, "s", "from an action to its force on the cart", at_least=0)
+    delay: float = parameter(
+        0.0, "s", "from an action to its force on the cart", at_least=0, at_most=60
+    )
     position_noise: float = parameter(
         0.0, "m", "standard deviation of the noise on x as observed", at_least=0
     )
@@ -106,7 +114,7 @@ class CartPoleParameters:
                 f"{self.owner}: upright_time is {self.upright_time:g} s but must be at most the "
                 f"duration, {self.duration:g} s"
             )
-        timestep, longest = 1.0 / (self.control_rate * _substeps(self)), 1.0 / _fastest_rate(self)
+        timestep, longest = 1.0 / (self.control_rate * substeps(self)), 1.0 / _fastest_rate(self)
         if timestep > longest:
             raise MisstepError(
                 f"{self.owner}: physics_step is {self.physics_step:g} s, too long to simulate how "
@@ -114,7 +122,7 @@ class CartPoleParameters:
             )
 
 
-class CartPole(System):
+class CartPole(Simulated):
     """Keep a pole upright by pushing the cart that it is hinged to.
 
     The hinge swings all the way round; the rail ends in stops that the cart does not bounce off.
@@ -239,15 +247,7 @@ class CartPole(System):
 
     def __init__(self, render_mode: str | None = None, **parameters: ParameterValue) -> None:
         p = build_parameters(self.parameters_type, self.system_id, parameters)
-        if render_mode not in (None, "rgb_array"):
-            raise MisstepError(
-                f"{self.system_id}: render_mode is {render_mode!r}; there is: 'rgb_array'"
-            )
-        self.render_mode = render_mode
-        self.parameters = asdict(p)
-        self.metadata = {**self.metadata, "render_fps": round(p.control_rate)}
-        self.dt = 1.0 / p.control_rate
-
+        super().__init__(p, cartpole_spec(p), render_mode)
         bound = np.array([np.inf, np.inf, np.pi, np.inf])
         self.observation_space = gymnasium.spaces.Box(-bound, bound, dtype=np.float64)
         limit = p.force_limit
@@ -267,12 +267,9 @@ class CartPole(System):
         noise = (p.position_noise, p.velocity_noise, p.angle_noise, p.angular_velocity_noise)
         self._noise = np.array(noise) if any(noise) else None
 
-        self.model = compiled(cartpole_spec(p), self.system_id)
-        self.data = mujoco.MjData(self.model)
         # Views into MuJoCo's memory, kept because asking for them takes longer than a step.
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
 
-        self._substeps = _substeps(p)
         self._timestep = float(self.model.opt.timestep)
         delay_substeps = round(p.delay / self._timestep)
         # A delay of w whole control periods and r further substeps: the force changes after the
@@ -280,11 +277,8 @@ class CartPole(System):
         self._delay_periods, self._late_substeps = divmod(delay_substeps, self._substeps)
         self._pending: deque[float] = deque()
         self._force = 0.0
-        self._painter: Any = None
-        self._over = True
         self._failed = False
         self._held = 0
-        self._t = 0
 
     @property
     def state(self) -> NDArray[np.float64]:
@@ -434,26 +428,9 @@ class CartPole(System):
             cartpole_spec(p).compile(), ("x", "theta"), ("x_dot", "theta_dot"), typical, p.delay
         )
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """Return a picture of the true state, shape (360, 640, 3), with ``"rgb_array"``."""
-        if self.render_mode is None:
-            return None
-        if self._painter is None:
-            # Drawing needs OpenGL, which simulating does not.
-            from misstep.systems.rendering import Painter
-
-            self._painter = Painter(self.system_id, self.parameters)
-        x, _, theta, _ = self.state
-        picture: NDArray[np.uint8] = self._painter.paint(
-            {"x": float(x), "theta": float(theta)}, {"force": self._force}, self._t * self.dt
-        )
-        return picture
-
-    def close(self) -> None:
-        """Release what `render` holds."""
-        if self._painter is not None:
-            self._painter.close()
-            self._painter = None
+    def _look(self) -> Look:
+        x, _, theta, _ = self._true_state()
+        return Look({"x": x, "theta": theta}, {"force": self._force})
 
 
 def cartpole_spec(p: CartPoleParameters) -> Any:
@@ -463,7 +440,7 @@ def cartpole_spec(p: CartPoleParameters) -> Any:
     )
     # Measured without damping over 10 s at the default step, the energy (0.5 J) drifts by 4e-8 J
     # with RK4 (the XML's choice); implicitfast at 2 ms drifts by 4e-3 J and takes longer.
-    timestep = 1.0 / (p.control_rate * _substeps(p))
+    timestep = 1.0 / (p.control_rate * substeps(p))
     spec.option.timestep = timestep
     spec.option.gravity = (0.0, 0.0, -p.gravity)
 
@@ -508,9 +485,3 @@ def _fastest_rate(p: CartPoleParameters) -> float:
     )
     swinging = np.linalg.eigvals(np.linalg.solve(inertia, np.diag([0.0, p.gravity * coupling])))
     return float(max(np.abs(braking).max(), np.sqrt(np.abs(swinging).max()), 1e-9))
-
-
-def _substeps(p: CartPoleParameters) -> int:
-    """Return into how many equal steps a control period is cut, none above `physics_step`."""
-    # The margin keeps 0.02 s / 0.01 s at 2 in floating point.
-    return max(1, math.ceil(1.0 / (p.control_rate * p.physics_step) - 1e-9))

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from misstep.costs import StateCost
 from misstep.errors import MisstepError, reason_of
-from misstep.judges import Judge
 from misstep.parameters import ParameterValue, build_parameters, check_parameters, parameter
 from misstep.systems.judged import Judged
+from misstep.systems.simulated import LONGEST_TIME, SHORTEST_STEP
 from misstep.systems.system import System
 from misstep.trajectory import Column
 
@@ -30,12 +30,20 @@ class GymParameters:
     """What can be set on a `GymSystem` itself; anything else goes to the environment."""
 
     duration: float = parameter(
-        0.0, "s", "length of an episode that does not end early; 0: the environment's", at_least=0
+        0.0,
+        "s",
+        "length of an episode that does not end early; 0: the environment's",
+        at_least=0,
+        at_most=LONGEST_TIME,
     )
     dt: float = parameter(0.0, "s", "control period; 0: as the environment says", at_least=0)
 
     def __post_init__(self) -> None:
         check_parameters(self, "gym")
+        if 0.0 < self.dt < SHORTEST_STEP:
+            raise MisstepError(
+                f"gym: dt is {self.dt:g} s but must be at least {SHORTEST_STEP:g} s, or 0"
+            )
 
 
 @dataclass(frozen=True)
@@ -180,6 +188,18 @@ class GymSystem(System):
         self._env = _make(env_id, render_mode, parameters)
         self.render_mode = render_mode
         self.metadata = self._env.metadata
+        self._over = True
+        self._t = 0
+        try:
+            self._describe(env_id, p, parameters)
+        except MisstepError:
+            self.close()
+            raise
+
+    def _describe(
+        self, env_id: str, p: GymParameters, parameters: Mapping[str, ParameterValue]
+    ) -> None:
+        """Tell the clock, the spaces, the columns and what else is known of the environment."""
         self.dt = p.dt or _control_period(self._env, self.system_id)
         self._n_steps = _n_steps(p.duration, self.dt, env_id)
         if self._n_steps < 1:
@@ -202,8 +222,6 @@ class GymSystem(System):
         self.action_columns = _columns(known.actions)
         self.default_judge = known.judge
         self.cost = known.cost
-        self._over = True
-        self._t = 0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -275,16 +293,24 @@ def make_gym_system(name: str, judge: Mapping[str, Any], parameters: Mapping[str
         As `GymSystem` and `Judged`; and if nobody says what a success or a failure is.
     """
     system = GymSystem(name.removeprefix(PREFIX), **parameters)
-    told: dict[str, Judge | float] = dict(judge)
-    if "success" not in told and "failure" not in told:
-        if not system.default_judge:
-            listed = ", ".join(column.name for column in system.observation_columns)
-            raise MisstepError(
-                f"{name} does not say what it is to succeed or to fail: give success or failure, a "
-                f"condition on the columns {listed}"
-            )
-        told = {**system.default_judge, **told}
-    return Judged(system, **told)  # type: ignore[arg-type]
+    try:
+        return Judged(system, **_complete(judge, system))
+    except MisstepError:
+        system.close()
+        raise
+
+
+def _complete(judge: Mapping[str, Any], system: GymSystem) -> dict[str, Any]:
+    """Return what to judge by: the default where neither success nor failure is told."""
+    if "success" in judge or "failure" in judge:
+        return dict(judge)
+    if not system.default_judge:
+        listed = ", ".join(column.name for column in system.observation_columns)
+        raise MisstepError(
+            f"{system.system_id} does not say what it is to succeed or to fail: give success or "
+            f"failure, a condition on the columns {listed}"
+        )
+    return {**system.default_judge, **judge}
 
 
 def _make(env_id: str, render_mode: str | None, parameters: Mapping[str, Any]) -> Any:
@@ -302,9 +328,8 @@ def _make(env_id: str, render_mode: str | None, parameters: Mapping[str, Any]) -
             disable_env_checker=True,
             **parameters,
         )
-    except (gymnasium.error.Error, ImportError, OSError, TypeError, ValueError) as error:
-        reason = reason_of(error)
-        raise MisstepError(f"gym:{env_id} cannot be made: {reason}") from error
+    except Exception as error:  # whatever somebody else's code makes of parameters that are wrong
+        raise MisstepError(f"gym:{env_id} cannot be made: {reason_of(error)}") from error
 
 
 def _control_period(env: Any, name: str) -> float:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from misstep.errors import MisstepError
 from misstep.judges import Formula, Judge, parse_cost, parse_predicate
 from misstep.parameters import ParameterRow, ParameterValue
+from misstep.systems.simulated import LONGEST_TIME
 from misstep.systems.system import System
 
 JUDGE_PARAMETERS = (
@@ -48,7 +49,7 @@ class Judged(System):
     success, failure : str or callable, optional
         A formula (`misstep.judges`), or a function of the observation (n,).
     hold : float, s
-        Of the success, at least 0.
+        Of the success, from 0 to 10⁹.
     cost : str or callable, optional
         A formula for a number, or a function of the observation.
 
@@ -60,8 +61,8 @@ class Judged(System):
     Raises
     ------
     MisstepError
-        If nothing is given to judge by, a formula cannot be read, or `hold` is negative or comes
-        without a success.
+        If nothing is given to judge by, a formula cannot be read, or `hold` is out of its range
+        or comes without a success.
     """
 
     def __init__(
@@ -196,8 +197,11 @@ def _read(
 def _steps_to_hold(name: str, hold: float, success: Formula | None, dt: float) -> int:
     """Return at how many observations in a row the success must hold."""
     number = isinstance(hold, int | float) and not isinstance(hold, bool)
-    if not (number and math.isfinite(hold) and hold >= 0):
-        raise MisstepError(f"{name}: hold is {hold!r} but must be a time in s, at least 0")
+    if not (number and 0 <= hold <= LONGEST_TIME):
+        raise MisstepError(
+            f"{name}: hold is {hold!r} but must be a time in s, at least 0 and at most "
+            f"{LONGEST_TIME:g}"
+        )
     if hold and success is None:
         raise MisstepError(f"{name}: hold is {hold:g} s but there is no success to hold")
     return round(hold / dt) + 1

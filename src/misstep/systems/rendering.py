@@ -29,7 +29,7 @@ from misstep.systems.cartpole_drawing import CartPoleScene, CartPoleSketch
 from misstep.systems.drawing import DARK, GREEN, RED
 from misstep.systems.flipup_drawing import FlipUpScene, FlipUpSketch
 from misstep.systems.offscreen import NoOpenGLError
-from misstep.trajectory import Outcome, Trajectory
+from misstep.trajectory import Column, Outcome, Trajectory
 
 INK, FAINT = DARK, "#6b7785"
 _OUTCOME_COLOURS = {Outcome.SUCCESS: GREEN, Outcome.FAILURE: RED}
@@ -219,8 +219,12 @@ def frames(
     # Checked here and not in the generator, whose body runs only when the first frame is wanted.
     source = trajectory.provenance
     drawing, _ = _drawings_of(source.system)
-    observations = _columns(trajectory, trajectory.observations, drawing.columns)
-    actions = _columns(trajectory, trajectory.actions, (drawing.action_column,))
+    observations = _columns(
+        "observation", trajectory.observation_columns, trajectory.observations, drawing.columns
+    )
+    actions = _columns(
+        "action", trajectory.action_columns, trajectory.actions, (drawing.action_column,)
+    )
     shown = _shown_steps(trajectory, fps)
     painter = Painter(source.system, source.parameters, width=width, height=height, title=title)
     return _paint_all(painter, trajectory, observations, actions, shown)
@@ -261,8 +265,7 @@ def write_video(
     MisstepError
         As `frames`; and if the path does not end in ``.mp4`` or cannot be written.
     """
-    if Path(path).suffix.lower() != ".mp4":
-        raise MisstepError(f"cannot write {path}: a video is an MP4 file, name it NAME.mp4")
+    _check_ending(path)
     pictures = frames(trajectory, fps, width, height, title)
     atomic_write(path, lambda temporary: _encode(pictures, temporary, fps, (width, height)))
 
@@ -295,14 +298,18 @@ def write_side_by_side(
     MisstepError
         As `write_video`.
     """
-    if Path(path).suffix.lower() != ".mp4":
-        raise MisstepError(f"cannot write {path}: a video is an MP4 file, name it NAME.mp4")
+    _check_ending(path)
     sides = [
         frames(trajectory, fps, width, height, title)
         for trajectory, title in zip(trajectories, titles, strict=True)
     ]
     size = (width * len(sides), height)
     atomic_write(path, lambda temporary: _encode(_beside(sides), temporary, fps, size))
+
+
+def _check_ending(path: str | os.PathLike[str]) -> None:
+    if Path(path).suffix.lower() != ".mp4":
+        raise MisstepError(f"cannot write {path}: a video is an MP4 file, name it NAME.mp4")
 
 
 def _beside(sides: Sequence[Iterator[NDArray[np.uint8]]]) -> Iterator[NDArray[np.uint8]]:
@@ -358,17 +365,15 @@ def _tell_flat(reason: str) -> None:
 
 
 def _columns(
-    trajectory: Trajectory, table: NDArray[np.float64], names: tuple[str, ...]
+    kind: str, columns: Sequence[Column], table: NDArray[np.float64], names: tuple[str, ...]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the columns `names` of the observations or actions by name."""
-    acting = table is trajectory.actions
-    columns = trajectory.action_columns if acting else trajectory.observation_columns
+    """Return the columns `names` of a table of observations or actions by name."""
     known = [column.name for column in columns]
     for name in names:
         if name not in known:
             raise MisstepError(
-                f"a picture needs the {'action' if acting else 'observation'} column {name!r}; "
-                f"the trajectory has: {', '.join(known)}"
+                f"a picture needs the {kind} column {name!r}; the trajectory has: "
+                f"{', '.join(known)}"
             )
     return {name: table[:, known.index(name)] for name in names}
 

@@ -8,9 +8,8 @@ never sees a command that was ignored.
 """
 
 import inspect
-import math
 from abc import abstractmethod
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
 from misstep.parameters import check_parameters, parameter, parameter_table
-from misstep.systems.system import System, compiled
+from misstep.systems.simulated import LONGEST_TIME, SHORTEST_STEP, Look, Simulated, substeps
 from misstep.trajectory import Column
 
 
@@ -39,16 +38,24 @@ class StrikingParameters:
     stop_speed: float = parameter(
         0.01, "m/s", "the stroke is over when less is commanded", at_least=0
     )
-    longest_stroke: float = parameter(1.5, "s", "the stroke is over after this time", above=0)
-    longest_wait: float = parameter(
-        3.0, "s", "no verdict this long after the stroke is a failure", above=0
+    longest_stroke: float = parameter(
+        1.5, "s", "the stroke is over after this time", above=0, at_most=LONGEST_TIME
     )
-    control_rate: float = parameter(200.0, "Hz", "actions per second", above=0)
+    longest_wait: float = parameter(
+        3.0,
+        "s",
+        "no verdict this long after the stroke is a failure",
+        above=0,
+        at_most=LONGEST_TIME,
+    )
+    control_rate: float = parameter(
+        200.0, "Hz", "actions per second", at_least=1e-3, at_most=1 / SHORTEST_STEP
+    )
     physics_step: float = parameter(
         0.001,
         "s",
         "longest step of the simulation; a control period is cut into equal ones",
-        above=0,
+        at_least=SHORTEST_STEP,
         at_most=0.002,
     )
     gravity: float = parameter(9.81, "m/s²", "downward acceleration", above=0)
@@ -78,7 +85,7 @@ class StrikingParameters:
         raise NotImplementedError
 
 
-class StrikingSystem(System):
+class StrikingSystem(Simulated):
     """A system in which an effector strikes once along its stroke.
 
     A task says where an episode starts, what is observed, how far from success it is, and when
@@ -110,32 +117,18 @@ class StrikingSystem(System):
             cls.__doc__ = _documented(inspect.cleandoc(cls.__doc__), cls.parameters_type)
 
     def __init__(self, p: StrikingParameters, spec: Any, render_mode: str | None) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise MisstepError(
-                f"{self.system_id}: render_mode is {render_mode!r}; there is: 'rgb_array'"
-            )
-        self.render_mode = render_mode
-        self.parameters = asdict(p)
-        self.metadata = {**self.metadata, "render_fps": round(p.control_rate)}
-        self.dt = 1.0 / p.control_rate
-
+        super().__init__(p, spec, render_mode)
         n = len(self.observation_columns)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, shape=(n,), dtype=np.float64)
         self.action_space = gymnasium.spaces.Box(0.0, p.v_max, shape=(1,), dtype=np.float64)
 
-        self.model = compiled(spec, self.system_id)
-        self.data = mujoco.MjData(self.model)
         self._joints = {
             self.model.joint(i).name: int(self.model.jnt_qposadr[i]) for i in range(self.model.njnt)
         }
         self._v_max, self._stop_speed = p.v_max, p.stop_speed
-        self._substeps = substeps(p)
         self._stroke_periods = max(1, round(p.longest_stroke * p.control_rate))
         self._wait_periods = max(1, round(p.longest_wait * p.control_rate))
-        self._painter: Any = None
-        self._over = True
         self._success = False
-        self._t = 0
         self._velocity = 0.0
 
     def reset(
@@ -223,28 +216,11 @@ class StrikingSystem(System):
     def _watch(self) -> bool:
         """Simulate what follows the stroke up to the verdict, and return whether it succeeded."""
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """Return a picture of the state, shape (360, 640, 3), with ``"rgb_array"``."""
-        if self.render_mode is None:
-            return None
-        if self._painter is None:
-            # Drawing needs OpenGL, which simulating does not.
-            from misstep.systems.rendering import Painter
-
-            self._painter = Painter(self.system_id, self.parameters)
+    def _look(self) -> Look:
         names = [column.name for column in self.observation_columns]
         observation = dict(zip(names, self._observe().tolist(), strict=True))
         verdict = ("failure", "success")[self._success] if self._over and self._t else ""
-        picture: NDArray[np.uint8] = self._painter.paint(
-            observation, {"velocity": self._velocity}, self._t * self.dt, verdict
-        )
-        return picture
-
-    def close(self) -> None:
-        """Release what `render` holds."""
-        if self._painter is not None:
-            self._painter.close()
-            self._painter = None
+        return Look(observation, {"velocity": self._velocity}, verdict)
 
 
 _ACTION = """\
@@ -300,9 +276,3 @@ def striking_spec(file: str, p: StrikingParameters) -> Any:
     servo.gainprm[0], servo.biasprm[2] = p.servo_gain, -p.servo_gain
     servo.forcerange = (-p.force_limit, p.force_limit)
     return spec
-
-
-def substeps(p: StrikingParameters) -> int:
-    """Return into how many equal steps a control period is cut, none above `physics_step`."""
-    # The margin keeps 0.005 s / 0.001 s at 5 in floating point.
-    return max(1, math.ceil(1.0 / (p.control_rate * p.physics_step) - 1e-9))

@@ -6,14 +6,14 @@ parameters the same system can be built again.
 """
 
 import math
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from misstep.costs import StateCost
-from misstep.errors import MisstepError, reason_of
+from misstep.errors import MisstepError
 from misstep.parameters import ParameterValue
 from misstep.systems.mechanics import Mechanics
 from misstep.trajectory import Column
@@ -112,26 +112,3 @@ class System(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
                 f"{self.system_id}: the action is {number} {unit}, which is not a finite {quantity}"
             )
         return number
-
-
-def compiled(spec: Any, owner: str) -> Any:
-    """Return the model of MuJoCo that a specification describes.
-
-    Parameters
-    ----------
-    spec : mujoco.MjSpec
-    owner : str
-        The system's name, for messages.
-
-    Raises
-    ------
-    MisstepError
-        If MuJoCo finds its numbers impossible: a mass or an inertia too small to move.
-    """
-    try:
-        return spec.compile()
-    except ValueError as error:
-        reason = reason_of(error)
-        raise MisstepError(
-            f"{owner}: MuJoCo cannot build it with these parameters: {reason}"
-        ) from error

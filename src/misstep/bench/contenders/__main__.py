@@ -51,13 +51,7 @@ def scan_from_starts(
     def run() -> None:
         fitted[:] = fit_all(X, starts(), job["iterations"])
 
-    seconds = _times(run, job["repeats"])
-    totals = [float(total) for _, total in fitted]
-    return {
-        "seconds": seconds,
-        "log_likelihoods": totals,
-        "mixture": _listed(library, fitted[-1][0]),
-    }
+    return {"seconds": _times(run, job["repeats"]), "mixture": _listed(library, fitted[-1][0])}
 
 
 def scan(library: ModuleType, job: dict[str, Any], arrays: dict[str, Any]) -> dict[str, Any]:
@@ -143,16 +137,23 @@ def _status(name: str) -> int:
 
 def _answer(library: ModuleType, line: str) -> dict[str, Any]:
     job = json.loads(line)
-    arrays = {name: np.load(path, allow_pickle=False) for name, path in job["arrays"].items()}
-    if not hasattr(library, "scan" if job["operation"] == "scan" else _NEEDS[job["operation"]]):
+    if not hasattr(library, _NEEDS[job["operation"]]):
         return {"error": "not offered"}
+    arrays = {name: np.load(path, allow_pickle=False) for name, path in job["arrays"].items()}
     try:
         return OPERATIONS[job["operation"]](library, job, arrays)
     except Exception as error:  # whatever a library raises is its result
         return {"error": " ".join(f"{type(error).__name__}: {error}".split())[:300]}
 
 
-_NEEDS = {"fit": "fit", "scan_from_starts": "fit", "query": "querier", "memory": "fit"}
+_NEEDS = {
+    "fit": "fit",
+    "scan_from_starts": "fit",
+    "scan": "scan",
+    "query": "querier",
+    "memory": "fit",
+}
+"""The function of a contender's module that an operation needs."""
 
 
 def serve(name: str, jobs: TextIO, answers: TextIO) -> None:

@@ -15,6 +15,7 @@ from misstep.formats.format import BLOCK_ROWS, Block, FloatArray
 _LONGEST_WAIT = 16 * BLOCK_ROWS  # ticks, for a topic that has fallen silent
 
 _LONGEST_PAUSE = 10**6  # ticks without a message
+_SILENCE = 2.0  # pauses of a topic, the longest, after which it has fallen silent
 
 _Nanoseconds = int
 
@@ -25,6 +26,7 @@ class _Track:
     def __init__(self) -> None:
         self._times: list[float] = []
         self._values: list[float] = []
+        self.longest = 0.0  # s between two samples
 
     @property
     def last(self) -> float:
@@ -35,6 +37,8 @@ class _Track:
         """Add a sample; return whether it was later than the last one, as it has to be."""
         if time <= self.last:
             return False
+        if self._times:
+            self.longest = max(self.longest, time - self._times[-1])
         self._times.append(time)
         self._values.append(value)
         return True
@@ -72,7 +76,8 @@ class Clock:
     ignored : int
         Samples that were not later than the one before them.
     held : bool
-        Whether a topic fell silent so long that its last observation was held.
+        Whether a topic fell silent so long, on the way or at the end, that its last observation was
+        held.
     """
 
     def __init__(self, n_observations: int, n_actions: int, rate: float | None) -> None:
@@ -136,7 +141,11 @@ class Clock:
 
     def last_block(self) -> Block | None:
         """Return what is left, when no message comes any more."""
-        return self._emitted(len(self._ticks), is_last=True) if self._ticks else None
+        if not self._ticks:
+            return None
+        end = self._ticks[-1]
+        self.held |= any(t.last + _SILENCE * t.longest < end for t in self._observations)
+        return self._emitted(len(self._ticks), is_last=True)
 
     def _seconds(self, time: _Nanoseconds) -> float:
         if self._zero is None:

@@ -171,6 +171,7 @@ class Bag:
     def _numbers(self, places: Sequence[Place]) -> dict[Place, list[Place]]:
         """Return all numbers below each place, as the first messages of its topic have them."""
         found: dict[Place, dict[Place, None]] = {place: {} for place in places}
+        asked_for = {*(self._options.observations or ()), *(self._options.actions or ())}
         missing = {place.topic: _SAMPLES for place in places}
         for _, topic, content in self.messages(missing):
             missing[topic] -= 1
@@ -180,14 +181,10 @@ class Bag:
             if all(left <= 0 for left in missing.values()):
                 break
         for place, numbers in found.items():
-            named = str(place) in (*(self._options.observations or ()), *self._named_actions())
-            if not numbers and named:
+            if not numbers and str(place) in asked_for:
                 kind = self.types[place.topic]
                 raise MisstepError(f"there is no number at {place}: messages there are {kind}")
         return {place: list(numbers) for place, numbers in found.items()}
-
-    def _named_actions(self) -> tuple[str, ...]:
-        return self._options.actions or ()
 
     def even_step(self, cutter: Cutter, clock_topic: str) -> float | None:
         """Return the time between messages of the clock's topic, s; None if they are uneven."""

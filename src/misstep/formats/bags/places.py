@@ -114,7 +114,7 @@ def _collect(place: Place, parent: Any, here: Any, found: list[Place]) -> None:
         found.append(place)
     elif isinstance(here, np.ndarray | list):
         names = _names_beside(parent)
-        by_name = len(names) == len(here) and len(set(names)) == len(names)
+        by_name = all(names) and len(set(names)) == len(names) == len(here)
         for index, element in enumerate(here):
             if len(found) > MOST_COLUMNS or isinstance(element, str):
                 break
@@ -138,9 +138,9 @@ def _element(values: Any, index: int) -> Any:
 
 
 def _names_beside(parent: Any) -> list[str]:
-    """Return the names that a message gives to the elements of its arrays."""
+    """Return the names that a message gives to the elements of its arrays, in their order."""
     for field in _NAMES:
         names = getattr(parent, field, None)
         if isinstance(names, list) and names and all(isinstance(name, str) for name in names):
-            return [name for name in names if name]
+            return names
     return []

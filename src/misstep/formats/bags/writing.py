@@ -101,7 +101,7 @@ class _Recorder:
 
     def __init__(self, writer: Any, typestore: "Typestore", is_ros1: bool) -> None:
         self._writer, self._typestore, self._is_ros1 = writer, typestore, is_ros1
-        self._connections: dict[str, tuple[Any, str]] = {}
+        self._connections: dict[str, Any] = {}  # by topic
         self._end = 0
 
     def episode(self, episode: Episode) -> None:
@@ -168,14 +168,14 @@ class _Recorder:
 
     def _write(self, time: int, topic: str, kind: str, **fields: Any) -> None:
         if topic not in self._connections:
-            made = self._writer.add_connection(topic, kind, typestore=self._typestore)
-            self._connections[topic] = made, kind
-        connection, _ = self._connections[topic]
+            self._connections[topic] = self._writer.add_connection(
+                topic, kind, typestore=self._typestore
+            )
         message = self._typestore.types[kind](**fields)
         serialize = (
             self._typestore.serialize_ros1 if self._is_ros1 else self._typestore.serialize_cdr
         )
-        self._writer.write(connection, time, serialize(message, kind))
+        self._writer.write(self._connections[topic], time, serialize(message, kind))
 
 
 _MOMENT, _SECOND = 10**6, 10**9  # ns
@@ -229,7 +229,7 @@ def write_mcap(path: Path, episodes: Iterable[Episode]) -> None:
     """
 
     def fill(temporary: Path) -> None:
-        folder = temporary.parent / "bag"
+        folder = temporary.with_name(f"{temporary.name}.folder")
         _fill_ros2(folder, path, episodes, "MCAP")
         (made,) = folder.glob("*.mcap")
         made.replace(temporary)

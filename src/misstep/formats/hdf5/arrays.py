@@ -4,12 +4,10 @@ An array of up to 1,000 elements is stored plainly; up to 65,536 elements as one
 one in chunks of as many rows as make 65,536 elements. Chunks are shuffled and deflated.
 
 Reading takes nothing on trust. Links out of the file and any other way to store an array are
-refused, and chunks are inflated here, since the HDF5 library would inflate a few kilobytes into as
-much memory as they claim.
+refused, and chunks are inflated by `misstep.formats.hdf5.chunks`.
 """
 
 import math
-import zlib
 from typing import Any
 
 import h5py
@@ -18,6 +16,7 @@ from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
 from misstep.formats.hdf5.attributes import damage
+from misstep.formats.hdf5.chunks import check_sizes, filters_of, read_chunk
 
 FLOAT = np.dtype("<f8")
 BOOL = np.dtype(bool)
@@ -30,7 +29,7 @@ _PACKING = {"shuffle": True, "compression": "gzip", "compression_opts": 1}
 
 
 def _rows_of_a_chunk(row_shape: tuple[int, ...]) -> int:
-    return max(1, _CHUNK // max(1, *row_shape, 1))
+    return max(1, _CHUNK // max(1, math.prod(row_shape)))
 
 
 class RowWriter:
@@ -167,22 +166,12 @@ class RowReader:
         dataset = self._dataset
         if dataset.chunks is None:
             return bool(dataset.id.get_storage_size() == dataset.nbytes)
-        properties = dataset.id.get_create_plist()
-        filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
         rows = _rows_of_a_chunk(self._shape[1:])
         in_rows = self._shape[0] > rows and dataset.chunks == (rows, *self._shape[1:])
-        if filters != _FILTERS or not (in_rows or dataset.chunks == self._shape):
+        if filters_of(dataset) != _FILTERS or not (in_rows or dataset.chunks == self._shape):
             return False
-        n_bytes = math.prod(dataset.chunks) * self._dtype.itemsize
-        if n_bytes > _LARGEST_CHUNK:
-            raise MisstepError(
-                f"{self._name} would take up {n_bytes} bytes in one piece: at most "
-                f"{_LARGEST_CHUNK} are allowed"
-            )
-        # The library asks for as much memory as a chunk claims to take up in the file.
-        most = n_bytes + n_bytes // 500 + 64  # what cannot be deflated grows a little
-        too_large = dataset.id.chunk_iter(lambda chunk: chunk.size > most or None)
-        return too_large is None and dataset.id.get_storage_size() > 0
+        check_sizes(dataset, self._name, _LARGEST_CHUNK)
+        return bool(dataset.id.get_storage_size() > 0)
 
     def _stored_rows(self, n_rows: int) -> NDArray[Any]:
         """Return the next rows as they are stored together."""
@@ -192,8 +181,7 @@ class RowReader:
             return np.asarray(self._dataset[start : self._next])
         self._next = min(start + chunks[0], self._shape[0])
         offset = (start, *(0 for _ in self._shape[1:]))
-        skipped, stored = self._dataset.id.read_direct_chunk(offset)
-        return _unpack(stored, skipped, chunks, self._dtype)[: self._next - start]
+        return read_chunk(self._dataset, offset, _FILTERS)[: self._next - start]
 
 
 def member(group: h5py.Group, name: str, kind: type) -> Any:
@@ -214,28 +202,3 @@ def member(group: h5py.Group, name: str, kind: type) -> Any:
     if not isinstance(found, kind):
         raise MisstepError(f"{name} is not a {kind.__name__.lower()}")
     return found
-
-
-def _unpack(
-    stored: bytes, skipped: int, shape: tuple[int, ...], dtype: np.dtype[Any]
-) -> NDArray[Any]:
-    """Undo deflation and shuffling of one chunk, never making more than its shape holds.
-
-    `skipped` is HDF5's mask of filters that were left out when the chunk was written.
-    """
-    shuffling_skipped, deflation_skipped = skipped & 1, skipped & 2
-    size = math.prod(shape)
-    n_bytes = size * dtype.itemsize
-    plain = stored
-    if not deflation_skipped:
-        inflater = zlib.decompressobj()
-        plain = inflater.decompress(stored, n_bytes + 1)
-        if not inflater.eof:
-            raise MisstepError("a compressed array is longer or shorter than it has to be")
-    if len(plain) != n_bytes:
-        raise MisstepError(f"a compressed array holds {len(plain)} bytes, not {n_bytes}")
-    if shuffling_skipped:
-        return np.frombuffer(plain, dtype).reshape(shape)
-    # Shuffled: first the first byte of every number, then all second bytes, and so on.
-    planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, size)
-    return np.ascontiguousarray(planes.T).view(dtype).reshape(shape)

@@ -1,13 +1,12 @@
 """Arrays in HDF5 files of other projects, read some rows at a time, however they are chunked.
 
 Nothing is taken on trust: links out of the file, filters that are not built into HDF5, and chunks
-larger than memory should hold are refused. Deflated chunks are inflated here, since the HDF5
-library would inflate a few kilobytes into as much memory as they claim.
+larger than memory should hold are refused. Deflated chunks are inflated by
+`misstep.formats.hdf5.chunks`.
 """
 
 import itertools
 import math
-import zlib
 from typing import Any
 
 import h5py
@@ -17,11 +16,12 @@ from numpy.typing import NDArray
 from misstep.errors import MisstepError
 from misstep.formats.hdf5.arrays import member
 from misstep.formats.hdf5.attributes import damage
+from misstep.formats.hdf5.chunks import check_sizes, filters_of, read_chunk
 
 _LARGEST_CHUNK = 2**26  # bytes, inflated
+_LARGEST_LZF = 2**24  # bytes, inflated: the library does that itself
 _LARGEST_ROW = 2**20  # bytes
 _UNDONE = {h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32}
-_CHECKSUM = 4  # bytes of Fletcher's checksum at the end of a chunk
 
 
 class ForeignArray:
@@ -98,24 +98,14 @@ class ForeignArray:
 
     def _check_chunks(self) -> None:
         dataset, name = self._dataset, self._name
-        properties = dataset.id.get_create_plist()
-        filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
-        n_bytes = math.prod(dataset.chunks) * dataset.dtype.itemsize
-        if n_bytes > _LARGEST_CHUNK:
-            raise MisstepError(
-                f"{name} would take up {n_bytes} bytes in one piece: at most {_LARGEST_CHUNK} are "
-                "allowed"
-            )
-        strange = set(filters) - _UNDONE - {h5py.h5z.FILTER_LZF}
-        if strange or (h5py.h5z.FILTER_LZF in filters and n_bytes > 2**24):
+        filters = filters_of(dataset)
+        is_lzf = h5py.h5z.FILTER_LZF in filters
+        check_sizes(dataset, name, _LARGEST_LZF if is_lzf else _LARGEST_CHUNK)
+        if set(filters) - _UNDONE - {h5py.h5z.FILTER_LZF}:
             raise MisstepError(
                 f"{name} is packed with HDF5 filters {sorted(filters)}: rewrite it with gzip, lzf "
                 "or none"
             )
-        # The library asks for as much memory as a chunk claims to take up in the file.
-        most = n_bytes + n_bytes // 100 + 1024
-        if dataset.id.chunk_iter(lambda chunk: chunk.size > most or None) is not None:
-            raise MisstepError(f"{name} has a chunk that takes up more than it holds")
         chunks = math.prod(-(-n // c) for n, c in zip(dataset.shape, dataset.chunks, strict=True))
         if dataset.id.get_num_chunks() < chunks:
             raise MisstepError(f"{name} claims to be longer than what is stored of it")
@@ -136,7 +126,7 @@ class ForeignArray:
         for corner in itertools.product(*corners):
             if self._unpacked is None or self._unpacked[0] != corner:
                 self._unpacked = None  # before there is another one in memory
-                self._unpacked = corner, self._chunk(corner)
+                self._unpacked = corner, read_chunk(self._dataset, corner, self._filters or [])
             block = self._unpacked[1]
             first, last = max(corner[0], start), min(corner[0] + chunk[0], stop)
             rest = tuple(
@@ -148,29 +138,3 @@ class ForeignArray:
                 (slice(first - corner[0], last - corner[0]), *inside)
             ]
         return rows
-
-    def _chunk(self, corner: tuple[int, ...]) -> NDArray[Any]:
-        skipped, stored = self._dataset.id.read_direct_chunk(corner)
-        size = math.prod(self._dataset.chunks)
-        n_bytes = size * self._dtype.itemsize
-        for place in reversed(range(len(self._filters or ()))):
-            if not skipped >> place & 1:
-                stored = _undo(self._filters[place], stored, n_bytes, self._dtype.itemsize)  # type: ignore[index]
-        if len(stored) != n_bytes:
-            raise MisstepError(f"a chunk holds {len(stored)} bytes, not {n_bytes}")
-        return np.frombuffer(stored, self._dtype).reshape(self._dataset.chunks)
-
-
-def _undo(kind: int, stored: bytes, n_bytes: int, itemsize: int) -> bytes:
-    """Undo one filter of a chunk of `n_bytes`, never making more than those and a checksum."""
-    if kind == h5py.h5z.FILTER_FLETCHER32:
-        return stored[:-_CHECKSUM]
-    if kind == h5py.h5z.FILTER_DEFLATE:
-        inflater = zlib.decompressobj()
-        plain = inflater.decompress(stored, n_bytes + _CHECKSUM + 1)
-        if not inflater.eof:
-            raise MisstepError("a compressed array is longer or shorter than it has to be")
-        return plain
-    # Shuffled: first the first byte of every number, then all second bytes, and so on.
-    planes = np.frombuffer(stored, np.uint8).reshape(itemsize, -1)
-    return np.ascontiguousarray(planes.T).tobytes()

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import h5py
+import numpy as np
 
 from misstep.errors import MisstepError
 from misstep.formats.hdf5.attributes import damage
@@ -38,8 +39,6 @@ with h5py.File(sys.argv[1], "r") as file:
 texts = [t.decode() if isinstance(t, bytes) else str(t) for t in numpy.atleast_1d(found).ravel()]
 sys.stdout.write(json.dumps(texts))
 """
-
-
 _SCRIPT_ALL = """
 import h5py
 def visit(_, member):
@@ -89,7 +88,7 @@ def read_texts(file: h5py.File, path: Path, name: str, attribute: str | None = N
         plain = kind.kind == "S" and size <= _LARGEST and (attribute or not owner.chunks)
         if plain and (attribute or not (owner.is_virtual or owner.external)):
             found = owner.attrs[attribute] if attribute else owner[()]
-            return [text.decode() for text in ([found] if attribute else found.ravel().tolist())]
+            return [text.decode() for text in np.atleast_1d(found).ravel().tolist()]
     if h5py.check_string_dtype(kind) is None:
         raise MisstepError(f"{what} is no text")
     return _read_apart(path, what, [name] if attribute is None else [name, attribute])

@@ -56,7 +56,8 @@ class UnfailingFile:
     def write(self, data: "bytes | memoryview") -> int:
         """Write at the position; whatever happens, all of it counts as written."""
         left, at = memoryview(data).cast("B"), self._position
-        self._position += len(left)
+        size = len(left)
+        self._position += size
         self._size = max(self._size, self._position)
         try:
             while len(left) and self._error is None:
@@ -67,7 +68,7 @@ class UnfailingFile:
             self._error = error
         if len(left):
             self._kept.append((at, bytes(left)))
-        return len(memoryview(data).cast("B"))
+        return size
 
     def read(self, size: int) -> bytes:
         """Read `size` bytes at the position; h5py asks whether there is such a method."""

@@ -189,7 +189,8 @@ def _tasks(meta: Path) -> dict[int, str]:
     file = meta / "tasks.parquet"
     if file.is_file():
         with damage("tasks.parquet"):
-            table = _opened(file).read(use_threads=False)
+            with _opened(file) as parquet_file:
+                table = parquet_file.read(use_threads=False)
             (texts,) = (name for name in table.column_names if name != "task_index")
             indices = table.column("task_index").to_pylist()
             tasks = dict(zip(indices, map(str, table.column(texts).to_pylist()), strict=True))
@@ -228,8 +229,7 @@ def _pieces(
     """Yield all rows of all files, with the number of their episode."""
     for done, path in enumerate(files, start=1):
         place = f"{path.parent.name}/{path.name}"
-        with damage(place):
-            file = _opened(path)
+        with damage(place), _opened(path) as file:
             there = set(file.schema_arrow.names)
             wanted = [f.key for f in (*info.observations, *info.actions)]
             wanted += [key for key in (*_INDEX, *info.others) if key in there]
@@ -241,7 +241,6 @@ def _pieces(
             rows = max(1, min(BLOCK_ROWS, _MOST_NUMBERS // sum(widths.values())))
             for batch in file.iter_batches(rows, columns=wanted, use_threads=False):
                 yield from _pieces_of(batch, info)
-            file.close()
         if options.report is not None:
             options.report(done, len(files))
 
@@ -378,7 +377,8 @@ class _EpisodeRows:
                 costs = 0.0 - piece.rewards
             if held is not None:
                 actions = np.concatenate([held[0], actions])
-                costs = None if costs is None or held[1] is None else _end_to_end(held[1], costs)
+                has_both = costs is not None and held[1] is not None
+                costs = np.concatenate([held[1], costs]) if has_both else None
             # The last action waits: whether an observation follows, only the next piece tells.
             held = actions[-1:], None if costs is None else costs[-1:]
             yield Block(
@@ -416,8 +416,3 @@ class _EpisodeRows:
         if self._succeeded is None:
             return Ending(notes=notes)
         return Ending(Outcome.SUCCESS if self._succeeded else Outcome.FAILURE, notes=notes)
-
-
-def _end_to_end(left: FloatArray, right: FloatArray) -> FloatArray:
-    joined: FloatArray = np.concatenate([left, right])
-    return joined

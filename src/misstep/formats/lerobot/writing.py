@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,13 +45,14 @@ def write(path: Path, episodes: Iterable[Episode], version: str = "v3.0") -> Non
 
     def fill(folder: Path) -> None:
         writer: _Writer | None = None
-        for index, episode in enumerate(uniform(path, episodes)):
-            with prefixed(f"cannot write {path}: episode_{index}"), damage("what is written"):
-                if writer is None:
-                    writer = _WRITERS[version](folder, episode.header)
-                writer.episode(index, episode)
-        if writer is not None:
-            writer.close()
+        with ExitStack() as open_files:
+            for index, episode in enumerate(uniform(path, episodes)):
+                with prefixed(f"cannot write {path}: episode_{index}"), damage("what is written"):
+                    if writer is None:
+                        writer = _WRITERS[version](folder, episode.header, open_files)
+                    writer.episode(index, episode)
+            if writer is not None:
+                writer.close()
 
     write_folder(path, fill, recognise)
 
@@ -110,13 +112,23 @@ class _Statistics:
 
 
 class _Writer:
-    """Writes one data set, episode by episode; what both versions have in common."""
+    """Writes one data set, episode by episode; what both versions have in common.
+
+    Parameters
+    ----------
+    folder : Path
+        To be made.
+    header : Header
+        Of the first episode.
+    open_files : ExitStack
+        Closes in the end, whatever happens, what is open for the whole time.
+    """
 
     version: str
     data_path: str
     chunks_size = 1000
 
-    def __init__(self, folder: Path, header: Header) -> None:
+    def __init__(self, folder: Path, header: Header, open_files: ExitStack) -> None:
         self.folder = folder
         self.fps = _fps(header)
         self.robot = header.provenance.system
@@ -124,7 +136,9 @@ class _Writer:
         self.total_episodes = self.total_frames = 0
         self._features = _features_of(header)
         (folder / "meta").mkdir(parents=True)
-        self._annotations = open(folder / "meta" / "misstep.jsonl", "w", encoding="utf-8")  # noqa: SIM115
+        self._annotations = open_files.enter_context(
+            (folder / "meta" / "misstep.jsonl").open("w", encoding="utf-8")
+        )
 
     def episode(self, index: int, episode: Episode) -> None:
         """Write one episode."""
@@ -196,7 +210,6 @@ class _Writer:
 
     def close(self) -> None:
         """Write what is said of all episodes."""
-        self._annotations.close()
         self.write_json("info.json", {**self._info(), **self.more_info()})
 
     def more_info(self) -> dict[str, Any]:
@@ -300,8 +313,8 @@ class _Writer30(_Writer):
     data_path = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
     file_size = 100  # MB
 
-    def __init__(self, folder: Path, header: Header) -> None:
-        super().__init__(folder, header)
+    def __init__(self, folder: Path, header: Header, open_files: ExitStack) -> None:
+        super().__init__(folder, header, open_files)
         self._files = 0
         self._file: parquet.ParquetWriter | None = None
         self._path = folder

@@ -116,7 +116,8 @@ class _Reader:
         actions = flat(self._dataset.action_space, data.actions, "action")
         rewards = _vector(data.rewards, "rewards")
         steps = said.get("total_steps", len(rewards))
-        if not np.array_equal(steps, len(rewards)):  # an attribute can be a whole table
+        number = isinstance(steps, int | float | np.number)  # an attribute can be a whole table
+        if not number or steps != len(rewards):
             raise MisstepError(
                 f"total_steps is {steps}, but minari reads {len(rewards)}: it is damaged, or "
                 "longer than Minari's arrow storage can read"

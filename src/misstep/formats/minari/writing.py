@@ -129,8 +129,8 @@ def _buffer(episode: Episode, folder: Path, storage: str) -> tuple[Any, str]:
             f"it has {len(block.observations)} rows: minari reads no more than {_ARROW_ROWS} back "
             "from arrow; write it with --format minari, in HDF5"
         )
-    needed = 4 * (block.observations.nbytes + block.actions.nbytes) + _SPARE
-    if shutil.disk_usage(folder).free < needed:
+    room = 4 * (block.observations.nbytes + block.actions.nbytes) + _SPARE
+    if shutil.disk_usage(folder).free < room:
         # The HDF5 library crashes on a disk that is full, so that is kept from happening.
         raise MisstepError("the disk is full, or will be in a moment")
     steps = len(block.actions)

@@ -49,10 +49,11 @@ def read(path: Path, options: ReadOptions) -> Iterator[Episode]:
     if not path.is_file():
         raise MisstepError("it is a folder or a device; name a file")
     try:
-        with open(path, "rb") as file:
-            yield from _read(_Lines(file, options), options)
+        file = open(path, "rb")  # noqa: SIM115
     except OSError as error:
         raise MisstepError(f"{error.strerror}") from error
+    with file:
+        yield from _read(_Lines(file, options), options)
 
 
 def _read(lines: "_Lines", options: ReadOptions) -> Iterator[Episode]:
@@ -112,7 +113,10 @@ class _Lines:
     def _fill(self) -> bool:
         """Read a piece if no line waits; False at the end."""
         while not self._waiting:
-            data = self._file.read(_PIECE)
+            try:
+                data = self._file.read(_PIECE)
+            except OSError as error:
+                raise MisstepError(f"{error.strerror}") from error
             if not data and not self._left:
                 return False
             whole, newline, rest = (self._left + data).rpartition(b"\n")
@@ -263,7 +267,8 @@ def write(path: Path, episodes: Iterable[Episode]) -> None:
     Raises
     ------
     MisstepError
-        If the episodes differ in their columns, there is none, or the file cannot be written.
+        If the episodes differ in their columns or dt, there is none, or the file cannot be
+        written.
     """
     delimiter = "\t" if path.suffix.lower() == ".tsv" else ","
 

@@ -1,6 +1,7 @@
 """Parquet: tables in columns, see `misstep.formats.tables`; through pyarrow."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from misstep.formats.libraries import needed, parquet_writer
 from misstep.formats.tables.table import (
     ANNOTATION,
     EPISODE,
+    SECONDS,
     Keys,
     Rows,
     Table,
@@ -23,7 +25,6 @@ from misstep.formats.tables.table import (
 from misstep.storage import atomic_write
 
 _GROUP_ROWS = 2**16  # of a row group
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
 def _arrow() -> Any:
@@ -42,10 +43,18 @@ def read(path: Path, options: ReadOptions) -> Iterator[Episode]:
     arrow = _arrow()
     if not path.is_file():
         raise MisstepError("it is a folder or a device; name a file")
+    with _damage(arrow):
+        file = _opened(arrow, path)
+        reader = _RowReader(arrow, file, options)
+    with file:
+        yield from read_table(Table(reader.cells, True, "row", reader.rows), options)
+
+
+@contextmanager
+def _damage(arrow: Any) -> Iterator[None]:
+    """Tell what pyarrow raises over a damaged file as one line."""
     try:
-        with _opened(arrow, path) as file:
-            reader = _RowReader(arrow, file, options)
-            yield from read_table(Table(reader.cells, True, "row", reader.rows), options)
+        yield
     except (arrow.ArrowException, OSError, UnicodeDecodeError, MemoryError) as error:
         raise MisstepError(f"it is damaged ({reason_of(error)})") from error
 
@@ -75,28 +84,30 @@ class _RowReader:
 
     def rows(self, numbers: Sequence[int], key: int | None, text: int | None) -> Iterator[Rows]:
         """Yield rows of some columns, see `misstep.formats.tables.table.Table`."""
-        wanted = {self.cells[i] for i in (*numbers, key, text) if i is not None}
-        row, total = 0, self._file.metadata.num_rows
-        batches = self._file.iter_batches(
-            batch_size=BLOCK_ROWS, columns=sorted(wanted), use_threads=False
-        )
-        for batch in batches:
-            if not batch.num_rows:
-                continue
-            values = [self._numbers(batch, self.cells[i]) for i in numbers]
-            if key is not None:
-                values.append(self._key_numbers(batch, self.cells[key]))
-            texts = None if text is None else self._texts(batch, self.cells[text])
-            yield Rows(np.column_stack(values), texts, row)
-            row += batch.num_rows
-            if self._options.report is not None:
-                self._options.report(row, total)
+        # Here, since most of it happens while somebody goes through the rows of an episode.
+        with _damage(self._arrow):
+            wanted = {self.cells[i] for i in (*numbers, key, text) if i is not None}
+            row, total = 0, self._file.metadata.num_rows
+            batches = self._file.iter_batches(
+                batch_size=BLOCK_ROWS, columns=sorted(wanted), use_threads=False
+            )
+            for batch in batches:
+                if not batch.num_rows:
+                    continue
+                values = [self._numbers(batch, self.cells[i]) for i in numbers]
+                if key is not None:
+                    values.append(self._key_numbers(batch, self.cells[key]))
+                texts = None if text is None else self._texts(batch, self.cells[text])
+                yield Rows(np.column_stack(values), texts, row)
+                row += batch.num_rows
+                if self._options.report is not None:
+                    self._options.report(row, total)
 
     def _numbers(self, batch: Any, name: str) -> FloatArray:
         column, types = batch.column(name), self._arrow.types
         kind = column.type
         if types.is_timestamp(kind) or types.is_duration(kind):
-            return self._float64(column.cast("int64")) * _SECONDS[kind.unit]
+            return self._float64(column.cast("int64")) * SECONDS[kind.unit]
         if types.is_floating(kind) or types.is_integer(kind) or types.is_boolean(kind):
             return self._float64(column)
         held = kind.value_type if types.is_dictionary(kind) else kind
@@ -140,7 +151,8 @@ def write(path: Path, episodes: Iterable[Episode]) -> None:
     Raises
     ------
     MisstepError
-        If the episodes differ in their columns, there is none, or the file cannot be written.
+        If the episodes differ in their columns or dt, there is none, or the file cannot be
+        written.
     """
     arrow = _arrow()
 

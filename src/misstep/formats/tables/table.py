@@ -19,7 +19,7 @@ EPISODE, TIME, COST, ANNOTATION = "episode", "time [s]", "cost", "misstep"
 _ACTION, _OBSERVATION = "action:", "observation:"
 _TIMES = ("time", "t", "timestamp")  # names that say by themselves that they are times
 _CELL = re.compile(r"(.*\S) \[([^\[\]]*)\]")
-_SECONDS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 UNKNOWN = Provenance("", {}, "", None, "")
 
@@ -129,6 +129,8 @@ class _Roles:
         episode = cells.find(options.episode) if options.episode else cells.position(EPISODE)
         cost = cells.position(COST) if annotation is not None else None
         taken = {i for i in (time, episode, cost, annotation) if i is not None}
+        if options.rate is not None and not options.time:
+            time = None  # the rate says when rows were recorded, whatever the column holds
         wanted = [*(options.observations or ()), *(options.actions or ())]
         found = cells.find_all(wanted, taken)
         count = len(options.observations or ())
@@ -138,16 +140,15 @@ class _Roles:
         if not observations:
             raise MisstepError("no column is left for the observations")
         named = cells.columns
-        used = {*taken, *observations, *actions}
-        if options.rate is not None and not options.time and time is not None:
-            used.discard(time)  # the rate says when rows were recorded
+        special = (time, episode, cost, annotation)
+        used = {*observations, *actions, *(i for i in special if i is not None)}
         return cls(
             tuple(observations),
             _renamed([named[i] for i in observations], options.observations),
             tuple(actions),
             _renamed([named[i] for i in actions], options.actions),
             time,
-            options.time_unit or ("" if time is None else named[time].unit),
+            options.time_unit or ("" if time is None else named[time].unit) or "s",
             cost,
             episode,
             annotation,
@@ -186,7 +187,7 @@ class _Cells:
     def time(self) -> int | None:
         """Return the position of the column that says by its name that it is the time."""
         for i, column in enumerate(self.columns):
-            free = not self._kinds[i] and column.unit in _SECONDS
+            free = not self._kinds[i] and column.unit in ("", *SECONDS)
             if free and column.name.lower() in _TIMES:
                 return i
         return None
@@ -342,12 +343,12 @@ class _TableEpisode:
     def _times(self, values: FloatArray) -> FloatArray | None:
         if self.header.dt is not None:
             return None
-        if self._roles.time_unit not in _SECONDS:
+        if self._roles.time_unit not in SECONDS:
             raise MisstepError(
-                f"times are in {self._roles.time_unit!r}; there are: {', '.join(_SECONDS)}"
+                f"times are in {self._roles.time_unit!r}; there are: {', '.join(SECONDS)}"
             )
         position = len(self._roles.observations) + len(self._roles.actions)
-        return values[:, position] * _SECONDS[self._roles.time_unit]
+        return values[:, position] * SECONDS[self._roles.time_unit]
 
     def _annotation(self, rows: Rows, index: int) -> Annotation | None:
         text = rows.texts[index] if rows.texts else ""
@@ -400,7 +401,7 @@ def written_rows(episodes: Iterable[Episode]) -> Iterator[tuple[Header, Rows]]:
     Raises
     ------
     MisstepError
-        If an episode has other columns than the first, or there is none.
+        If an episode has other columns or another dt than the first, or there is none.
     """
     first: Header | None = None
     at = 0
@@ -418,8 +419,9 @@ def _episode_rows(number: int, episode: Episode, at: int) -> Iterator[Rows]:
     header = episode.header
     opening = Annotation(header, Ending(), has_costs=False).to_text()
     row, has_costs = 0, False
-    for block in aligned(episode.blocks, has_actions=bool(header.action_columns)):
-        count, last = len(block.observations), len(block.actions) < len(block.observations)
+    blocks = aligned(episode.blocks, has_actions=bool(header.action_columns))
+    for block, is_last in _with_last(blocks):
+        count = len(block.observations)
         has_costs = has_costs or block.costs is not None
         values = np.full(
             (count, 3 + block.observations.shape[1] + len(header.action_columns)), np.nan
@@ -434,10 +436,19 @@ def _episode_rows(number: int, episode: Episode, at: int) -> Iterator[Rows]:
         texts = [""] * count
         if row == 0:
             texts[0] = opening
-        if last:
+        if is_last:
             texts[-1] = Annotation(header, episode.ending(), has_costs).to_text()
         yield Rows(values, texts, at + row)
         row += count
+
+
+def _with_last(blocks: Iterator[Block]) -> Iterator[tuple[Block, bool]]:
+    """Yield each block, and whether it is the last: then the ending is known."""
+    block = next(blocks, None)
+    while block is not None:
+        following = next(blocks, None)
+        yield block, following is None
+        block = following
 
 
 def _times(block: Block, header: Header, row: int) -> FloatArray:

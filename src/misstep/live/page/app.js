@@ -5,7 +5,7 @@ import { AttemptList } from "misstep/attempts.js";
 import { Chart } from "misstep/chart.js";
 import { Density } from "misstep/density.js";
 import { fillSaveMenu, startHelp } from "misstep/dialogs.js";
-import { byId, h, nameOf, setText, show } from "misstep/dom.js";
+import { byId, h, nameOf, setText } from "misstep/dom.js";
 import { Figures } from "misstep/figures.js";
 import { download, startUploads } from "misstep/files.js";
 import { Hand } from "misstep/hand.js";

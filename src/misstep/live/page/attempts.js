@@ -4,7 +4,7 @@ import { byId, brief, GLYPHS, h, setText } from "misstep/dom.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 
-function trace(values, wraps) {
+function trace(values) {
   const svg = document.createElementNS(SVG, "svg");
   svg.setAttribute("viewBox", "0 0 100 26");
   svg.setAttribute("preserveAspectRatio", "none");
@@ -24,7 +24,7 @@ function trace(values, wraps) {
     piece = [];
   };
   values.forEach((value, i) => {
-    if (wraps && i && Math.abs(value - values[i - 1]) > 4) close();
+    if (i && Math.abs(value - values[i - 1]) > 4) close();
     piece.push(`${((100 * i) / Math.max(values.length - 1, 1)).toFixed(1)},${(13 - (12 * value) / most).toFixed(1)}`);
   });
   close();
@@ -62,7 +62,7 @@ export class AttemptList {
     return h("li", { className: attempt.id === open ? "open" : "" },
       h("span", { className: "n" }, String(number)),
       h("span", { className: mark, title: attempt.outcome }, GLYPHS[attempt.outcome]),
-      trace(attempt.trace, true),
+      trace(attempt.trace),
       h("span", { className: "num" }, `${attempt.duration.toFixed(2)} s`),
       h("span", { className: "num cost", title: "mean cost of a step" }, `cost ${brief(attempt.cost)}`),
       h("span", {},

@@ -1,6 +1,7 @@
 // What each attempt and each trial cost, or how long it lasted; one that is chosen is opened.
 
-import { brief, prepared, signed, ticks, fontSize } from "misstep/dom.js";
+import { brief, prepared, signed, ticks } from "misstep/dom.js";
+import { font, smallSize } from "misstep/pen.js";
 import { colours, faded } from "misstep/theme.js";
 
 export class Chart {
@@ -53,9 +54,9 @@ export class Chart {
     if (!ready || (!this.stale && !ready.resized && this.chosen === chosen)) return;
     this.stale = false;
     this.chosen = chosen;
-    const { pen, width, height } = ready, size = Math.max(11, 0.74 * fontSize());
+    const { pen, width, height } = ready, size = smallSize();
     pen.clearRect(0, 0, width, height);
-    pen.font = `${size}px ${getComputedStyle(document.body).fontFamily}`;
+    pen.font = font(size);
     const floor = height - 1.7 * size, top = 1.5 * size, right = width - 8, n = this.items.length;
     if (!n) {
       pen.fillStyle = colours.faint; pen.textAlign = "center"; pen.textBaseline = "middle";

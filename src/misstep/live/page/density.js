@@ -1,6 +1,7 @@
 // The density of the actions in this very state, its donut, and the action that was chosen.
 
-import { nameOf, prepared, shownUnit, ticks, fontSize } from "misstep/dom.js";
+import { nameOf, prepared, shownUnit, ticks } from "misstep/dom.js";
+import { font, smallSize, zoom } from "misstep/pen.js";
 import { colours, faded } from "misstep/theme.js";
 
 const POINTS = 161;
@@ -21,7 +22,7 @@ export class Density {
     if (!ready || !this.system) return;
     const { pen, width, height } = ready;
     pen.clearRect(0, 0, width, height);
-    const size = Math.max(11, 0.74 * fontSize()), floor = height - 2.5 * size, left = 6, right = width - 6;
+    const size = smallSize(), floor = height - 2.5 * size, left = 6, right = width - 6;
     const [low, high] = [this.system.low[0] ?? -1, this.system.high[0] ?? 1];
     const span = high - low, from = low - 0.12 * span, to = high + 0.12 * span;
     const X = (a) => left + ((a - from) / (to - from)) * (right - left);
@@ -42,7 +43,7 @@ export class Density {
   }
 
   drawAxis(pen, X, from, to, floor, size, left, right, height) {
-    pen.font = `${size}px ${getComputedStyle(document.body).fontFamily}`;
+    pen.font = font(size);
     pen.strokeStyle = faded(colours.steel, 0.7);
     pen.lineWidth = 1;
     pen.beginPath(); pen.moveTo(left, floor + 0.5); pen.lineTo(right, floor + 0.5); pen.stroke();
@@ -59,7 +60,7 @@ export class Density {
     pen.beginPath();
     grid.forEach((a, i) => pen.lineTo(X(a), Y(values[i])));
     pen.strokeStyle = stroke;
-    pen.lineWidth = (thickness * fontSize()) / 15;
+    pen.lineWidth = thickness * zoom();
     pen.lineJoin = "round";
     pen.stroke();
     if (fill) {
@@ -71,9 +72,9 @@ export class Density {
 
   drawChoice(pen, x, floor) {
     pen.strokeStyle = pen.fillStyle = colours.path;
-    const zoom = fontSize() / 15;
-    pen.lineWidth = 2 * zoom;
+    const unit = zoom();
+    pen.lineWidth = 2 * unit;
     pen.beginPath(); pen.moveTo(x, 4); pen.lineTo(x, floor); pen.stroke();
-    pen.beginPath(); pen.moveTo(x, floor - 7 * zoom); pen.lineTo(x - 6 * zoom, floor + 2 * zoom); pen.lineTo(x + 6 * zoom, floor + 2 * zoom); pen.closePath(); pen.fill();
+    pen.beginPath(); pen.moveTo(x, floor - 7 * unit); pen.lineTo(x - 6 * unit, floor + 2 * unit); pen.lineTo(x + 6 * unit, floor + 2 * unit); pen.closePath(); pen.fill();
   }
 }

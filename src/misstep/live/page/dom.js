@@ -22,7 +22,7 @@ export function show(element, visible) {
   if (element.hidden === visible) element.hidden = !visible;
 }
 
-export const isAngle = (column) => column.unit === "rad" || column.unit === "rad/s";
+const isAngle = (column) => column.unit === "rad" || column.unit === "rad/s";
 export const inShownUnit = (column, value) => (isAngle(column) ? (value * 180) / Math.PI : value);
 export const shownUnit = (column) =>
   column.unit === "rad" ? "°" : column.unit === "rad/s" ? "°/s" : column.unit;

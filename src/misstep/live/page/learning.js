@@ -133,7 +133,7 @@ export class LearningPanel {
   }
 }
 
-export function sentenceHere(conditional, action, system) {
+function sentenceHere(conditional, action, system) {
   const said = (value) => withUnit(signed(value), system.actions[0]);
   if (conditional.isFar) return `Nobody has been near this state before; it does ${said(action)}.`;
   const epsilon = `(ε ${conditional.epsilon.toFixed(2)})`;

@@ -1,7 +1,8 @@
 // The plane of one column of the state and the action: data, ellipses, the path being taken.
 // What stands still is drawn once and kept, so that a frame costs one copy and one path.
 
-import { inShownUnit, nameOf, prepared, shownUnit, ticks, fontSize } from "misstep/dom.js";
+import { inShownUnit, nameOf, prepared, shownUnit, ticks } from "misstep/dom.js";
+import { font, smallSize, zoom } from "misstep/pen.js";
 import { colours, faded } from "misstep/theme.js";
 
 const MOST_POINTS = 40000;
@@ -69,7 +70,7 @@ export class Plane {
 
   drawStill(width, height, ratio) {
     this.stale = false;
-    this.zoom = fontSize() / 15;
+    this.zoom = zoom();
     this.still.width = Math.round(width * ratio);
     this.still.height = Math.round(height * ratio);
     const pen = this.still.getContext("2d");
@@ -106,13 +107,13 @@ export class Plane {
   }
 
   drawAxes(pen, width, height, column) {
-    const size = Math.max(11, 0.74 * fontSize());
+    const size = smallSize();
     const left = 3.1 * size, bottom = 2.5 * size, top = 0.6 * size;
     this.inside = [left, top, width - left - 6, height - bottom - top];
     const [x0, y0, w, t] = this.inside;
     this.X = (x) => x0 + ((x - this.low) / (this.high - this.low)) * w;
     this.Y = (a) => y0 + t - ((a - this.down) / (this.up - this.down)) * t;
-    pen.font = `${size}px ${getComputedStyle(document.body).fontFamily}`;
+    pen.font = font(size);
     pen.lineWidth = 1;
     pen.strokeStyle = colours.line;
     pen.fillStyle = colours.faint;

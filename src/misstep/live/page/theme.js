@@ -2,7 +2,7 @@
 
 import { byId } from "misstep/dom.js";
 
-const NAMES = ["bg", "card", "ink", "faint", "line", "well", "shown", "path", "good", "mix", "bad", "steel", "cart"];
+const NAMES = ["card", "ink", "faint", "line", "shown", "path", "good", "mix", "bad", "steel", "cart"];
 const dark = matchMedia("(prefers-color-scheme: dark)");
 const listeners = [];
 
@@ -13,7 +13,7 @@ function stored() {
   try { return localStorage.getItem("misstep-theme"); } catch { return null; }
 }
 
-export function applyTheme(choice = stored()) {
+function applyTheme(choice = stored()) {
   const name = choice ?? (dark.matches ? "dark" : "light");
   document.documentElement.dataset.theme = name;
   const style = getComputedStyle(document.documentElement);

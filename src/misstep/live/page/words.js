@@ -46,11 +46,11 @@ export function calloutElement(told) {
 }
 
 export function sentence(state, viewer, library) {
-  const { run, mode, attempts, system } = state.session;
+  const { run, mode, attempts, system, drives } = state.session;
   if (viewer.trial !== null) return library.trials.get(viewer.trial)?.sentence ?? "";
   if (viewer.attempt !== null) {
     const number = attempts.findIndex((attempt) => attempt.id === viewer.attempt) + 1;
-    return `Attempt ${number}, as it was recorded. Mark below when it went wrong, or cut it.`;
+    return `Attempt ${number}, as it was recorded.${drives ? " Mark below when it went wrong, or cut it." : ""}`;
   }
   if (mode === "learning") return run?.trials.length ? run.trials.at(-1).sentence : "Learning from the attempts …";
   if (mode === "balancing") {

@@ -147,7 +147,7 @@ class SimulationNode:
         reset.stamp = self._stamp() if self._lock_step else time.time()
         reset.done.set()
         # In lock-step the first state must not be missed.
-        while self._lock_step and self._bus.count(self._topic) == 0:
+        while self._lock_step and not self._closing.is_set() and not self._bus.count(self._topic):
             time.sleep(0.001)
 
     def _publish(self, stamp: float) -> None:

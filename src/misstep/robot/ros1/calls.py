@@ -61,7 +61,9 @@ class PersistentCall:
             rospy.exceptions.ROSInternalException,
         ) as error:
             self.close()
-            raise MisstepError(f"the service {self._name}: {error}") from error
+            is_late = isinstance(error, BlockingIOError)  # how the operating system says it
+            reason = f"no answer in {self._timeout:g} s" if is_late else error
+            raise MisstepError(f"the service {self._name}: {reason}") from error
 
     def close(self) -> None:
         """Hang up; the next call connects anew. An answer that comes late finds nobody."""

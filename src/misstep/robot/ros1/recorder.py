@@ -5,10 +5,11 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from misstep.errors import MisstepError
+from misstep.robot.numbering import next_number
 from misstep.robot.ros.bus import JointArrays
 from misstep.robot.ros1.environment import import_ros
 from misstep.robot.ros1.messages import joint_state
+from misstep.storage import make_folder
 
 
 class BagRecorder:
@@ -27,10 +28,7 @@ class BagRecorder:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self._folder = Path(folder)
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise MisstepError(f"cannot make the folder {folder}: {error.strerror}") from error
+        make_folder(self._folder)
         self._bag_type = import_ros("rosbag").Bag
         self._time = import_ros("genpy").Time.from_sec
         self._float64 = import_ros("std_msgs.msg").Float64
@@ -40,7 +38,7 @@ class BagRecorder:
     def begin(self) -> None:
         """Begin the bag of the next attempt; that of an attempt in progress ends."""
         self.end()
-        number = sum(1 for _ in self._folder.glob("*.bag*"))
+        number = next_number(self._folder, "attempt_*.bag*")
         self._path = self._folder / f"attempt_{number:03d}.bag"
         with self._lock:
             self._bag = self._bag_type(f"{self._path}.active", "w")

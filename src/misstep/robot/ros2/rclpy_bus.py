@@ -4,6 +4,7 @@ Thin on purpose, and not tested: no ROS 2 runs where misstep is built. The messa
 those of the packages sensor_msgs, std_msgs, std_srvs and misstep_ros (``ros2/misstep_ros``).
 """
 
+import logging
 import threading
 from collections.abc import Callable, Mapping
 from importlib import import_module
@@ -13,6 +14,7 @@ from misstep.errors import MisstepError
 from misstep.robot.ros.bus import TRIGGER, Call, Handler, JointArrays
 from misstep.robot.ros2.types import joint_arrays
 
+_LOG = logging.getLogger(__name__)
 _DEPTH = 1000  # messages: in lock-step none may be lost
 _SOMEBODY = "a node of ROS 2"  # a request does not say whose it is
 
@@ -40,7 +42,7 @@ class RclpyBus:
         self._executor = import_module("rclpy.executors").MultiThreadedExecutor()
         self._executor.add_node(self._node)
         self._publishers: set[str] = set()
-        threading.Thread(target=self._executor.spin, name="rclpy", daemon=True).start()
+        threading.Thread(target=self._spin, name="rclpy", daemon=True).start()
 
     def publish_joints(self, topic: str) -> Callable[[JointArrays], None]:
         """Return a function that publishes joint states."""
@@ -116,6 +118,15 @@ class RclpyBus:
         """Leave the graph."""
         self._executor.shutdown()
         self._rclpy.shutdown()
+
+    def _spin(self) -> None:
+        """Serve until the end: what a callback raises, the executor's `spin` raises too."""
+        while self._rclpy.ok():
+            try:
+                self._executor.spin()
+                return
+            except Exception as error:  # whoever asked is not answered; the node goes on
+                _LOG.warning("a request or a message was refused: %s", error)
 
     def _publisher(self, topic: str, kind: Any) -> Any:
         self._publishers.add(topic)

@@ -89,19 +89,19 @@ class ZenohBus:
 
         def answer(query: Any) -> None:
             try:
+                if query.payload is None or query.attachment is None:
+                    raise MisstepError("a request has a payload and an attachment")
+                number, _, _, gid = _ATTACHMENT.unpack(query.attachment.to_bytes())
                 request = self._types.decode(f"{name}_Request", query.payload.to_bytes())
                 fields = handler(request, _SOMEBODY)
-            except MisstepError as error:
+                if not isinstance(fields, Mapping):
+                    fields = dict(zip(response, fields, strict=True))
+                reply = self._types.encode(f"{name}_Response", fields)
+            except Exception as error:  # the caller is told; the service goes on, as rospy's does
                 query.reply_err(str(error))
                 return
-            if not isinstance(fields, Mapping):
-                fields = dict(zip(response, fields, strict=True))
-            number, _, _, gid = _ATTACHMENT.unpack(query.attachment.to_bytes())
-            query.reply(
-                key,
-                self._types.encode(f"{name}_Response", fields),
-                attachment=_ATTACHMENT.pack(number, time.time_ns(), 16, gid),
-            )
+            attachment = _ATTACHMENT.pack(number, time.time_ns(), 16, gid)
+            query.reply(key, reply, attachment=attachment)
 
         def serve_on() -> None:
             for query in queries:
