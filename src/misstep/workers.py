@@ -18,6 +18,7 @@ from multiprocessing.connection import Connection
 from typing import Any, NamedTuple, TypeVar
 
 from misstep.errors import MisstepError
+from misstep.threads import available_cores
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -79,11 +80,7 @@ def check_workers(workers: int | None) -> int:
     """
     if workers is not None and workers < 1:
         raise MisstepError(f"workers is {workers}: at least one process is needed")
-    if workers is not None:
-        return workers
-    from misstep.mixture.fitting import available_cores  # compiled loops: slow to import
-
-    return available_cores()
+    return workers or available_cores()
 
 
 class _Pool(ProcessPoolExecutor):

@@ -14,7 +14,6 @@ import math
 import multiprocessing
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 
 from misstep.mixture import em
 from misstep.mixture.em import Mixture, Moments, Rule, Samples, Work
+from misstep.threads import available_cores, thread_pool
 
 Array = NDArray[np.float64]
 Start = Callable[[], Mixture]
@@ -62,21 +62,13 @@ def available_threads() -> int:
     return available_cores()
 
 
-def available_cores() -> int:
-    """Return how many cores this process may use, which can be fewer than there are."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:
-        return os.cpu_count() or 1
-
-
 @contextmanager
 def spread_over(threads: int) -> Iterator[Spread]:
     """Yield a function that applies another to each of many arguments, in threads."""
     if threads == 1:
         yield lambda function, arguments: [function(a) for a in arguments]
         return
-    with ThreadPoolExecutor(threads) as pool:
+    with thread_pool(threads) as pool:
         yield lambda function, arguments: list(pool.map(function, arguments))
 
 

@@ -19,7 +19,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -40,6 +40,7 @@ from misstep.rollout import Policy, utc_now
 from misstep.runs import Run
 from misstep.storage import make_folder
 from misstep.systems import System
+from misstep.threads import thread_pool
 from misstep.trajectory import Dataset, Outcome, Trajectory
 
 OnTrial = Callable[[Run, Trajectory], None]
@@ -150,7 +151,7 @@ class ExplorationService:
         self._trial: ReportedTrial | None = None
         self._unkept: tuple[Proposal, Trajectory] | None = None
         self._log = self._open_log()
-        self._pool = ThreadPoolExecutor(1, "learning")
+        self._pool = thread_pool(1, "learning")
         self._job: Future[Proposal | None] = self._pool.submit(self._learn, None)
 
     # What a transport calls
