@@ -496,6 +496,7 @@ def test_lists_every_parameter_with_unit_and_documents_it():
         ({"stop_at_fall": 1}, "stop_at_fall is 1 but must be true or false"),
         ({"duration": 0.001}, "duration is 0.001 s, shorter than one control period of 0.02 s"),
         ({"hinge_damping": 50.0}, "physics_step is 0.01 s, too long .* at most"),
+        ({"hinge_damping": 1e308}, "damping of .* is too strong for such small masses"),
         ({"track_limit": -1.0}, "track_limit is -1 m but must be at least 0 m"),
         ({"upright_time": 31.0}, "upright_time is 31 s but must be at most the duration, 30 s"),
         ({"render_mode": "human"}, "render_mode is 'human'; there is: 'rgb_array'"),

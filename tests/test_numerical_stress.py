@@ -734,6 +734,14 @@ def test_a_spread_that_leaves_the_range_of_numbers(distance, d):
             np.testing.assert_allclose(exploration, expected, rtol=1e-9)
 
 
+@pytest.mark.parametrize("variance", [1e300, 1e308])
+def test_a_donut_whose_density_is_no_number_is_flat(variance):
+    donut = Donut([1.5], [[variance]], DonutShape.of(1.0, d=1))
+    near = [[1.5], [2.1], [-0.4]]
+    assert not np.isnan(donut.log_pdf(near)).any()
+    np.testing.assert_array_equal(donut.gradient(near), np.zeros((3, 1)))
+
+
 @pytest.mark.parametrize("gap", [0.0, 1e-16, 1e-15])
 def test_a_singular_covariance(refused, gap):
     singular = np.array([[1.0, 1.0 - gap], [1.0 - gap, 1.0]]) * np.outer(

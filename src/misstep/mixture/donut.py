@@ -169,9 +169,9 @@ class Donut:
         rows = []
         for point in checked_points(a, self.mean.size):
             value, slope, direction = self._evaluate(point)
+            density = math.exp(value)
             # Beyond the range of double precision the density is flat, and the slope infinite.
-            is_zero = value == -math.inf
-            rows.append(np.zeros_like(point) if is_zero else math.exp(value) * slope * direction)
+            rows.append(density * slope * direction if density else np.zeros_like(point))
         return np.array(rows)
 
     def _evaluate(self, point: Array) -> tuple[float, float, Array]:

@@ -480,8 +480,12 @@ def _fastest_rate(p: CartPoleParameters) -> float:
             f"{p.owner}: masses of {p.cart_mass:g} and {p.pole_mass:g} kg and a half length of "
             f"{p.half_length:g} m are too far apart to reckon with"
         )
-    braking = np.linalg.eigvals(
-        np.linalg.solve(inertia, np.diag([p.cart_damping, p.hinge_damping]))
-    )
-    swinging = np.linalg.eigvals(np.linalg.solve(inertia, np.diag([0.0, p.gravity * coupling])))
-    return float(max(np.abs(braking).max(), np.sqrt(np.abs(swinging).max()), 1e-9))
+    braking = np.linalg.solve(inertia, np.diag([p.cart_damping, p.hinge_damping]))
+    swinging = np.linalg.solve(inertia, np.diag([0.0, p.gravity * coupling]))
+    if not (np.isfinite(braking).all() and np.isfinite(swinging).all()):
+        raise MisstepError(
+            f"{p.owner}: damping of {p.cart_damping:g} N s/m and {p.hinge_damping:g} N m s/rad or "
+            f"a gravity of {p.gravity:g} m/s² is too strong for such small masses"
+        )
+    fastest_swing = np.sqrt(np.abs(np.linalg.eigvals(swinging)).max())
+    return float(max(np.abs(np.linalg.eigvals(braking)).max(), fastest_swing, 1e-9))
