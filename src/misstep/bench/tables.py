@@ -189,7 +189,7 @@ def _own(rows: Sequence[Row]) -> Table:
         "trial": "one trial, simulated: 30 s at 50 Hz, donut policy",
         "refit": "one refit of the donut learner after four demonstrations",
         "paper": "the whole paper, `misstep reproduce --seeds 1`, compiled code cached",
-        "paper, first time": "the same, the time before",
+        "paper, first time": "the whole paper, the run before that one",
     }
     return Table(
         "own",
