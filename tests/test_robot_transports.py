@@ -439,6 +439,24 @@ def test_an_answer_that_comes_too_late_is_not_taken_for_the_next(served, scripte
         assert (command.action, command.sequence) == ((4.0,), 2)
 
 
+def test_a_client_for_whom_there_is_no_thread_is_let_go_and_the_next_one_let_in(
+    served, monkeypatch
+):
+    one, start, refused = served("unix"), threading.Thread.start, []
+
+    def start_or_refuse(thread):
+        if threading.current_thread().name == "listener" and not refused:
+            refused.append(thread)
+            raise RuntimeError("can't start new thread")  # as without memory
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", start_or_refuse)
+    with pytest.raises(MisstepError):
+        one.client()
+    assert len(refused) == 1
+    one.client().close()
+
+
 # A robot that learn drives
 
 

@@ -73,7 +73,14 @@ class SocketServer:
             stream = FrameStream(connection)
             with self._lock:
                 self._streams.add(stream)
+            self._give_thread(connection, stream)
+
+    def _give_thread(self, connection: socket.socket, stream: FrameStream) -> None:
+        try:
             threading.Thread(target=self._serve, args=(connection, stream), daemon=True).start()
+        except RuntimeError as error:  # no memory for one: others may still be let in later
+            _LOG.warning("a client could not be let in: %s", error)
+            self._forget(stream)
 
     def _serve(self, connection: socket.socket, stream: FrameStream) -> None:
         try:
@@ -84,9 +91,12 @@ class SocketServer:
         except OSError as error:
             _LOG.info("a client is lost: %s", error)
         finally:
-            with self._lock:
-                self._streams.discard(stream)
-            stream.close()
+            self._forget(stream)
+
+    def _forget(self, stream: FrameStream) -> None:
+        with self._lock:
+            self._streams.discard(stream)
+        stream.close()
 
     def _converse(self, stream: FrameStream) -> None:
         try:
