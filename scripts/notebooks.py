@@ -1,7 +1,7 @@
 """Run notebooks from the top and keep what they show.
 
-python scripts/notebooks.py examples/*.ipynb                # in their place
-python scripts/notebooks.py examples/idea.ipynb --out DIR   # what `tests/test_examples.py` does
+After a change of a notebook: ``python scripts/notebooks.py examples/*.ipynb``. With ``--out`` the
+outputs go to another folder, where `tests/test_examples.py` compares them with what was kept.
 """
 
 import argparse

@@ -31,22 +31,26 @@ def main(path: Path) -> None:
     ends = [(attempt, attempt.n_steps) for attempt in failures]
     tried = [(attempt, attempt.n_steps) for attempt in donut.trials]
     balanced = [(success, int(t)) for t in np.linspace(0, success.n_steps, FRAMES)]
-    with plots.style():
+    size = {"width": 2 * SIDE, "height": SIDE}
+    with plots.style(), Painter("cartpole", system.parameters, **size) as painter:
         figure = Figure(figsize=(10.4, 3.6))
         figure.get_layout_engine().set(h_pad=0.04)
         parts = figure.subfigures(1, 3, wspace=0.03)
-        draw(parts[0], "four demonstrations, all failed", ends)
-        draw(parts[1], "the paper explores away from them", tried)
-        draw(parts[2], "misstep balances it at once", balanced)
+        draw(parts[0], painter, "four demonstrations, all failed", ends)
+        draw(parts[1], painter, "the paper explores away from them", tried)
+        draw(parts[2], painter, "misstep balances it at once", balanced)
         figure.savefig(path)
 
 
-def draw(part: SubFigure, title: str, shown: Sequence[tuple[Trajectory, int]]) -> None:
+def draw(
+    part: SubFigure, painter: Painter, title: str, shown: Sequence[tuple[Trajectory, int]]
+) -> None:
     """Draw some attempts: pictures of their last moments above, the angle over time below."""
     grid = part.add_gridspec(2, FRAMES, height_ratios=(1, 1.9))
     for index, (attempt, step) in enumerate(shown):
         axes = part.add_subplot(grid[0, index])
-        axes.imshow(picture(attempt, step))
+        around_the_cart = slice(SIDE * 2 // 3), slice(SIDE * 2 // 3, SIDE * 4 // 3)
+        axes.imshow(painter.paint_step(attempt, step)[around_the_cart])
         axes.set(xticks=[], yticks=[])
         axes.set_xlabel(f"{step * attempt.dt:.1f} s", fontsize=8)
         axes.spines[:].set_visible(False)
@@ -61,16 +65,6 @@ def draw(part: SubFigure, title: str, shown: Sequence[tuple[Trajectory, int]]) -
     axes.axhspan(-30, 30, color=plots.FAINT, alpha=0.15, linewidth=0, zorder=0)
     axes.set(xlabel="time [s]", ylabel="lean [deg]", ylim=(-38, 38), yticks=(-30, 0, 30))
     axes.set_xlim(0, None)
-
-
-def picture(attempt: Trajectory, step: int) -> np.ndarray:
-    """Return the picture of an attempt after `step` actions, cut to what is around the cart."""
-    source = attempt.provenance
-    with Painter(source.system, source.parameters, width=2 * SIDE, height=SIDE) as painter:
-        state = {name: float(attempt.column(name)[step]) for name in ("x", "theta")}
-        force = float(attempt.actions[min(step, attempt.n_steps - 1), 0])
-        wide = painter.paint(state, {"force": force}, step * attempt.dt)
-    return wide[: SIDE * 2 // 3, SIDE * 2 // 3 : SIDE * 4 // 3]
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from misstep.blame import Blame
-from misstep.errors import MisstepError
 from misstep.inspection.figures import BLAME_COLOURS
 from misstep.plots import MODEL
 from misstep.trajectory import Trajectory
@@ -33,27 +32,16 @@ def draw_filmstrip(trajectory: Trajectory, blame: Blame) -> bytes:
     from misstep.systems.rendering import Painter
 
     source = trajectory.provenance
-    seen = [column.name for column in trajectory.observation_columns]
-    done = [column.name for column in trajectory.action_columns]
     width = PICTURES * (WIDTH + _SPACE) - _SPACE
     strip = Image.new("RGB", (width, HEIGHT + _BAR), "white")
     pen = ImageDraw.Draw(strip)
     steps = shown_steps(trajectory, blame)
     with Painter(source.system, source.parameters, width=WIDTH, height=HEIGHT) as painter:
         for place, step in enumerate(steps):
-            acted = min(step, trajectory.n_steps - 1)
-            try:
-                picture = painter.paint(
-                    dict(zip(seen, trajectory.observations[step].tolist(), strict=True)),
-                    dict(zip(done, trajectory.actions[acted].tolist(), strict=True)),
-                    float(step * trajectory.dt),
-                )
-            except KeyError as error:
-                raise MisstepError(
-                    f"a picture of {source.system} needs the column {error}"
-                ) from None
+            picture = painter.paint_step(trajectory, int(step))
             left = place * (WIDTH + _SPACE)
             strip.paste(Image.fromarray(picture), (left, 0))
+            acted = min(step, trajectory.n_steps - 1)
             colour = colors.to_hex(BLAME_COLOURS(float(blame.blame[acted])))
             pen.rectangle((left, HEIGHT, left + WIDTH - 1, HEIGHT + _BAR - 1), fill=colour)
             if step == _lost(trajectory, blame):

@@ -88,8 +88,7 @@ def _picture(trajectory: Trajectory, t: int, width: int, height: int) -> NDArray
     """Return the picture of a trajectory at step `t`, shape (height, width, 3)."""
     source = trajectory.provenance
     with Painter(source.system, source.parameters, width=width, height=height) as painter:
-        state = {name: float(trajectory.column(name)[t]) for name in ("x", "theta")}
-        return painter.paint(state, {"force": float(trajectory.actions[t, 0])}, t * trajectory.dt)
+        return painter.paint_step(trajectory, t)
 
 
 def _simulation(results: Results) -> Figure:

@@ -168,6 +168,28 @@ class Painter:
             pen.text((self._width - 38 * s, y), outcome, colour, self._small, anchor="ra")
         return np.asarray(picture)
 
+    def paint_step(self, trajectory: Trajectory, step: int) -> NDArray[np.uint8]:
+        """Return the picture, shape (height, width, 3), of a trajectory after `step` actions.
+
+        Raises
+        ------
+        MisstepError
+            If a column that the drawing needs is missing.
+        """
+        seen = [column.name for column in trajectory.observation_columns]
+        done = [column.name for column in trajectory.action_columns]
+        acted = min(step, trajectory.n_steps - 1)
+        try:
+            return self.paint(
+                dict(zip(seen, trajectory.observations[step].tolist(), strict=True)),
+                dict(zip(done, trajectory.actions[acted].tolist(), strict=True)),
+                float(step * trajectory.dt),
+            )
+        except KeyError as error:
+            raise MisstepError(
+                f"a picture of {trajectory.provenance.system} needs the column {error}"
+            ) from None
+
     def close(self) -> None:
         """Give back what OpenGL holds."""
         self._drawing.close()
