@@ -9,7 +9,6 @@ import sys
 import numpy as np
 
 from misstep.bench.contenders import misstep_itself
-from misstep.bench.problems import draw_path
 from misstep.mixture import em
 
 
@@ -31,20 +30,31 @@ def em_pass(d, K):
     return lambda: compiled.entry_point(*arguments)
 
 
-def query(d):
-    """One action of a donut policy, as a control loop asks for it."""
-    path = draw_path(4, d, 100)
-    policy = misstep_itself.querier(path.mixture, path.states.shape[1], path.scale, 2.0, 2.0)
-    for state in path.states[:50]:
+def query(n, m, K=4):
+    """One action of a donut policy, as a control loop asks for it.
+
+    The mixture is written down in fractions: what a library computes of random numbers differs
+    between processors in its last bits, and a climb may then take another step.
+    """
+    d = n + m
+    k, i, j = np.ogrid[:K, :d, :d]
+    covariances = 0.5 / (1.0 + (i - j) ** 2 + (k + i * j) % 3) + np.where(i == j, 1.0 + k % 2, 0.0)
+    covariances = 0.5 * (covariances + covariances.transpose(0, 2, 1))
+    means = ((7.0 * np.arange(K)[:, None] + 5.0 * np.arange(d)) % 11.0 - 5.0) / 4.0
+    mixture = np.array([0.125, 0.25, 0.375, 0.25]), means, covariances
+    policy = misstep_itself.querier(mixture, n, np.full(m, 0.5), 2.0, 2.0)
+    states = means[0, :n] + (means[1, :n] - means[0, :n]) * np.arange(64)[:, None] / 64.0
+    for state in states[:32]:
         policy(state, None)
-    return lambda: policy(path.states[50], None)
+    return lambda: policy(states[32], None)
 
 
 PATHS = {
     "EM, two columns": lambda: em_pass(2, K=4),
     "EM, five columns": lambda: em_pass(5, K=2),
-    "query, one action": lambda: query(2),
-    "query, two actions": lambda: query(14),
+    "query, one action": lambda: query(1, 1),
+    "query, two actions": lambda: query(12, 2),
+    "query, seven actions": lambda: query(7, 7),
 }
 
 if __name__ == "__main__":

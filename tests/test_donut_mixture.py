@@ -1,4 +1,5 @@
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -39,6 +40,42 @@ def slope(mixture, a):
     log_gradient = mixture.gradient([a])[0] / mixture.pdf([a])[0]
     variances = np.linalg.eigvalsh(mixture.conditional.covariances)
     return np.linalg.norm(log_gradient) * math.sqrt(variances.max())
+
+
+def curvature(mixture, a):
+    """Return log DMM(a), its gradient, its Hessian, and the metric of the climb."""
+    K, d = mixture.conditional.means.shape
+    whiteners, precisions, _, log_norms = mixture._components
+    gradient, metric, hessian = np.empty(d), np.empty((d, d)), np.empty((d, d))
+    value = compiled.mixture_curvature(
+        np.array(a),
+        np.log(mixture.conditional.weights),
+        mixture.conditional.means,
+        whiteners,
+        precisions,
+        log_norms,
+        mixture.shape,
+        gradient,
+        metric,
+        hessian,
+        compiled.scratch_for(K, d),
+    )
+    whole = [np.tril(half) + np.tril(half, -1).T for half in (hessian, metric)]
+    return value, gradient, *whole
+
+
+def climb_from(mixture, start):
+    """Return where a climb ends, and how many densities it took."""
+    a = np.array(start, dtype=float)
+    whiteners, precisions, _, log_norms = mixture._components
+    with np.errstate(divide="ignore"):
+        log_h = np.log(mixture.conditional.weights)
+    means = mixture.conditional.means
+    room = compiled.scratch_for(*means.shape)
+    _, count = compiled.ascend(
+        a, log_h, means, whiteners, precisions, log_norms, mixture.shape, room
+    )
+    return a, count
 
 
 # The density
@@ -101,6 +138,49 @@ def test_zero_density_has_no_slope():
     np.testing.assert_array_equal(mixture.gradient([[0.0, 0.0]]), [[0.0, 0.0]])
 
 
+def test_two_threads_may_ask_one_mixture(random_mixture):
+    # The compiled loops let go of the interpreter, so two of them really run side by side.
+    rng = np.random.default_rng(0)
+    mixture = DonutMixture(Conditional(*random_mixture(rng, 6, 2)), 0.7)
+    points = 3.0 * rng.normal(size=(4000, 2))
+    alone = mixture.log_pdf(points), mixture.gradient(points), mixture.mode([1.0, 1.0])
+
+    def differing(_):
+        answers = mixture.log_pdf(points), mixture.gradient(points), mixture.mode([1.0, 1.0])
+        return sum(np.sum(a != b) for a, b in zip(answers, alone, strict=True))
+
+    with ThreadPoolExecutor(2) as pool:
+        assert sum(pool.map(differing, range(120))) == 0  # of 480,000 densities
+
+
+@given(seed=SEEDS, d=st.integers(1, 5), K=st.integers(1, 4), exploration=EXPLORATIONS)
+def test_curvature(random_mixture, seed, d, K, exploration):
+    rng = np.random.default_rng(seed)
+    mixture = DonutMixture(Conditional(*random_mixture(rng, K, d)), exploration)
+    a = 2.0 * rng.normal(size=d)
+    value, gradient, hessian, metric = curvature(mixture, a)
+    expected = reference.log_donut_mixture(a, *mixture.conditional, *mixture.shape)
+    scale = 1.0 + np.abs(expected[1]).max() ** 2
+    assert value == pytest.approx(expected[0], rel=1e-8)
+    np.testing.assert_allclose(gradient, expected[1], rtol=1e-6, atol=1e-8 * scale)
+    np.testing.assert_allclose(hessian, expected[2], rtol=1e-6, atol=1e-7 * scale)
+    np.testing.assert_allclose(metric, expected[3], rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("d", [1, 2, 5, 14])
+def test_curvature_is_the_slope_of_the_slope(random_mixture, d):
+    rng = np.random.default_rng(d)
+    mixture = DonutMixture(Conditional(*random_mixture(rng, 3, d)), 0.9)
+    a, step = mixture.mode() + 0.3 * rng.normal(size=d), 1e-6
+    differences = [
+        (curvature(mixture, a + step * axis)[1] - curvature(mixture, a - step * axis)[1])
+        / (2.0 * step)
+        for axis in np.eye(d)
+    ]
+    hessian = curvature(mixture, a)[2]
+    np.testing.assert_allclose(hessian, differences, atol=1e-6 * np.abs(hessian).max())
+
+
 # The mode
 
 
@@ -124,10 +204,79 @@ def test_a_mode_lies_above_its_start(random_mixture, seed, d, K, exploration, wa
     np.testing.assert_array_equal(mixture.mode(start), mode)
 
 
+def test_a_climb_takes_few_steps(random_mixture):
+    counts, n_out = [], 0
+    for seed in range(1000):
+        rng = np.random.default_rng(seed)
+        d, K = int(rng.integers(1, 15)), int(rng.integers(1, 11))
+        mixture = DonutMixture(Conditional(*random_mixture(rng, K, d)), rng.random())
+        starts = mixture.mode(), mixture.mode() + 0.3 * rng.normal(size=d)
+        for start in starts:
+            end, count = climb_from(mixture, start)
+            counts.append(count)
+            n_out += slope(mixture, end) > 1e-3
+    assert np.median(counts) <= 6
+    assert max(counts) <= compiled.MAX_ASCENT == 30
+    assert n_out <= 0.005 * len(counts)
+
+
+def test_a_level_ridge_is_not_walked_along():
+    # A ring whose height changes by less than a double can tell.
+    conditional = Conditional(
+        np.array([1.0 - 1e-14, 1e-14]),
+        np.array([[0.0, 0.0], [9.0, 0.0]]),
+        np.tile(np.eye(2), (2, 1, 1)),
+    )
+    mixture = DonutMixture(conditional, 0.9)
+    start = np.array([-mixture.ridge_radius, 0.5])
+    end, count = climb_from(mixture, start)
+    assert count < 10
+    assert np.linalg.norm(end) == pytest.approx(mixture.ridge_radius, abs=1e-5)
+    assert end[0] < -1.5
+
+
+def test_a_tilted_ridge_is_walked_along_to_its_top():
+    # The heavier neighbour lies to the right, the climb begins on the left.
+    conditional = Conditional(
+        np.array([0.8, 0.2]), np.array([[0.0, 0.0], [4.0, 0.0]]), np.tile(np.eye(2), (2, 1, 1))
+    )
+    mixture = DonutMixture(conditional, 0.9)
+    end, count = climb_from(mixture, [-1.9, 0.1])
+    assert end[0] > 1.0
+    assert slope(mixture, end) < 1e-4
+    assert count <= 25
+
+
+@pytest.mark.parametrize("d", [1, 2, 3, 6])
+def test_the_compiled_climb_ends_where_the_reference_does(random_mixture, d):
+    n, same, lower = 60, 0, 0
+    for seed in range(n):
+        rng = np.random.default_rng([seed, d])
+        conditional = Conditional(*random_mixture(rng, int(rng.integers(1, 4)), d))
+        mixture = DonutMixture(conditional, rng.random())
+        start = mixture.mode() + 0.3 * rng.normal(size=d)
+        ours, _ = climb_from(mixture, start)
+        theirs = reference.climb(start, *conditional, *mixture.shape)
+        metric = curvature(mixture, theirs)[3]
+        same += math.sqrt((ours - theirs) @ metric @ (ours - theirs)) < 0.05
+        lower += mixture.log_pdf([ours])[0] < mixture.log_pdf([theirs])[0] - 1e-6
+    assert same >= 0.9 * n
+    assert lower <= 0.05 * n
+
+
+def test_a_climb_leaves_a_hill_that_has_lost_its_weight():
+    means, covariances = np.array([[0.0], [1000.0]]), np.ones((2, 1, 1))
+    for weight in (0.0, 2e-86, 1e-9):
+        conditional = Conditional(np.array([1.0 - weight, weight]), means, covariances)
+        mixture = DonutMixture(conditional, 0.5)
+        assert abs(mixture.mode([1001.0])[0]) == pytest.approx(mixture.ridge_radius, abs=1e-5)
+    # A hill that the demonstrators do go to is stayed on, however small it is.
+    mixture = DonutMixture(Conditional(np.array([0.999, 0.001]), means, covariances), 0.5)
+    assert mixture.mode([1001.0])[0] == pytest.approx(1000.0 + mixture.ridge_radius, abs=1e-5)
+
+
 @pytest.mark.parametrize("d", [2, 3])
 def test_nearly_every_mode_of_a_vector_is_a_local_maximum(random_mixture, d):
-    # The ridge of a donut in the plane is a ring, nearly level where others hardly tilt it: there
-    # the climb may reach its bound first.
     n, maxima = 200, 0
     for seed in range(n):
         rng = np.random.default_rng(seed)
@@ -138,7 +287,7 @@ def test_nearly_every_mode_of_a_vector_is_a_local_maximum(random_mixture, d):
         steps *= 1e-2 / np.linalg.norm(steps, axis=1, keepdims=True)
         is_top = np.all(mixture.pdf(mode + steps) <= mixture.pdf([mode]) * (1.0 + 1e-7))
         maxima += slope(mixture, mode) < 1e-4 and is_top
-    assert maxima >= 0.97 * n
+    assert maxima >= 0.99 * n
 
 
 @given(exploration=st.floats(0.2, 1.0), reach=st.floats(1.0, 4.0), start=st.floats(0.01, 10.0))

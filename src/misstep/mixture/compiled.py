@@ -78,17 +78,18 @@ LOWEST = -1e300
 
 def scratch_for(K: int, d: int) -> Array:
     """Return the room that a query of K components and d actions works in."""
-    return np.empty(K * (3 + 2 * d) + 6 * d + 3 * d * d)
+    return np.empty(K * (4 + 2 * d) + 8 * d + 5 * d * d)
 
 
 @njit(inline="always", _nrt=False)
 def _component_rooms(scratch, n_components, d):
-    """h, value and slope (K,), m and direction (K, d)."""
-    a, b = 3 * n_components, n_components * d
+    """h, value, slope and squared (K,), m and direction (K, d)."""
+    a, b = 4 * n_components, n_components * d
     return (
         scratch[:n_components],
         scratch[n_components : 2 * n_components],
-        scratch[2 * n_components : a],
+        scratch[2 * n_components : 3 * n_components],
+        scratch[3 * n_components : a],
         scratch[a : a + b].reshape((n_components, d)),
         scratch[a + b : a + 2 * b].reshape((n_components, d)),
     )
@@ -96,15 +97,15 @@ def _component_rooms(scratch, n_components, d):
 
 @njit(inline="always", _nrt=False)
 def _vector_room(scratch, n_components, d, i):
-    """One of six vectors (d,)."""
-    begin = n_components * (3 + 2 * d) + i * d
+    """One of eight vectors (d,)."""
+    begin = n_components * (4 + 2 * d) + i * d
     return scratch[begin : begin + d]
 
 
 @njit(inline="always", _nrt=False)
 def _matrix_room(scratch, n_components, d, i):
-    """One of three matrices (d, d)."""
-    begin = n_components * (3 + 2 * d) + 6 * d + i * d * d
+    """One of five matrices (d, d)."""
+    begin = n_components * (4 + 2 * d) + 8 * d + i * d * d
     return scratch[begin : begin + d * d].reshape((d, d))
 
 
@@ -173,7 +174,7 @@ def exploration_of(spread, printed):
 
 @njit(**_INLINED)
 def _donut_terms(shape, d):
-    """r_α², r_β² − r_α², (γ − 1) kᵈ, the density at the centre in units of N, and d log r_α."""
+    """r_α², r_β² − r_α², (γ − 1) kᵈ, the centre's density in units of N, d log r_α, + log γ."""
     gamma, r_alpha, r_beta = shape
     a2 = r_alpha * r_alpha
     gap = r_beta * r_beta - a2
@@ -183,13 +184,14 @@ def _donut_terms(shape, d):
     # At full exploration the centre is zero; what rounding leaves there would be a false floor.
     if abs(centre) < 1e-14 * gamma + 4e-16 * ratio:
         centre = 0.0
-    return a2, gap, inner, centre, d * math.log(r_alpha)
+    log_width = d * math.log(r_alpha)
+    return a2, gap, inner, centre, log_width, log_width + math.log(gamma)
 
 
 @njit(**_INLINED)
 def _log_donut(squared, log_norm, terms):
     """Return log D at Mahalanobis² `squared`, and the factor g in ∇ log D = g Σ⁻¹(a − μ)."""
-    a2, gap, inner, centre, log_width = terms
+    a2, gap, inner, centre, log_width, _ = terms
     # expm1 keeps the bracket exact next to the centre, where it may vanish.
     rise = math.expm1(-0.5 * squared * gap)
     bracket = centre - inner * rise
@@ -206,206 +208,442 @@ def donut_log_density(squared, log_norm, gamma, r_alpha, r_beta, d):
 
 
 @njit(**_INLINED)
-def _log_donuts(a, log_h, m, whiteners, log_norms, shape, value, slope, direction, y):
-    """Fill each component's log h_k D_k(a) and what its gradient is made of; return the largest.
+def _log_donuts(a, log_h, m, whiteners, log_norms, terms, value, slope, squared, direction, y):
+    """Fill each component's log h_k D_k(a) and the makings of its derivatives; return the largest.
 
     Components passed over get −∞.
     """
     n_components, d = m.shape
-    terms = _donut_terms(shape, d)
-    most = terms[4] + math.log(shape[0])
     top = -np.inf
     for k in range(n_components):
-        squared = 0.0
+        q = 0.0
         for i in range(d):
             y[i] = 0.0
             for j in range(i + 1):
                 y[i] += whiteners[k, i, j] * (a[j] - m[k, j])
-            squared += y[i] * y[i]
+            q += y[i] * y[i]
+        squared[k] = q
+        if log_h[k] + log_norms[k] + terms[5] - 0.5 * terms[0] * q < top - NEGLIGIBLE:
+            value[k], slope[k] = -np.inf, 0.0
+            continue
         for j in range(d):
             direction[k, j] = 0.0
             for i in range(j, d):
                 direction[k, j] += whiteners[k, i, j] * y[i]
-        if log_h[k] + log_norms[k] + most - 0.5 * terms[0] * squared < top - NEGLIGIBLE:
-            value[k], slope[k] = -np.inf, 0.0
-            continue
-        v, slope[k] = _log_donut(squared, log_norms[k], terms)
+        v, slope[k] = _log_donut(q, log_norms[k], terms)
         value[k] = log_h[k] + v
         top = max(top, value[k])
     return top
 
 
-@njit(**COMPILED)
-def mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, metric, scratch):
-    """Return log DMM(a); fill its gradient (d,) and the metric (d, d), the mean precision there.
-
-    `shape` holds γ, r_α, r_β. Where the density is zero the gradient is zero and the metric the
-    first component's.
-    """
-    n_components, d = m.shape
-    _, value, slope, _, direction = _component_rooms(scratch, n_components, d)
-    y = _vector_room(scratch, n_components, d, 0)
-    top = _log_donuts(a, log_h, m, whiteners, log_norms, shape, value, slope, direction, y)
-    for i in range(d):
-        gradient[i] = 0.0
-        for j in range(d):
-            metric[i, j] = 0.0
-    silent = top == -np.inf
+@njit(**_INLINED)
+def _shares(value, top):
+    """Turn the components' log densities into their shares of the sum; return the sum's log."""
     total = 0.0
-    for k in range(n_components):
-        if silent:
+    for k in range(value.shape[0]):
+        if top == -np.inf:
             value[k] = 1.0 if k == 0 else 0.0
         elif value[k] < top - NEGLIGIBLE:
             value[k] = 0.0
         else:
             value[k] = math.exp(value[k] - top)
         total += value[k]
-    for k in range(n_components):
-        rho = value[k] / total
-        if rho == 0.0:
-            continue
-        for i in range(d):
-            gradient[i] += rho * slope[k] * direction[k, i]
-            for j in range(d):
-                for q in range(max(i, j), d):
-                    metric[i, j] += rho * whiteners[k, q, i] * whiteners[k, q, j]
+    for k in range(value.shape[0]):
+        value[k] /= total
     return top + math.log(total)
+
+
+@njit(**COMPILED)
+def mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, scratch):
+    """Return log DMM(a) and fill its gradient (d,).
+
+    `shape` holds γ, r_α, r_β. Where the density is zero the gradient is zero.
+    """
+    n_components, d = m.shape
+    _, value, slope, squared, _, direction = _component_rooms(scratch, n_components, d)
+    y = _vector_room(scratch, n_components, d, 0)
+    terms = _donut_terms(shape, d)
+    top = _log_donuts(a, log_h, m, whiteners, log_norms, terms, value, slope, squared, direction, y)
+    density = _shares(value, top)
+    for i in range(d):
+        gradient[i] = 0.0
+    for k in range(n_components):
+        if value[k] > 0.0 and top > -np.inf:
+            for i in range(d):
+                gradient[i] += value[k] * slope[k] * direction[k, i]
+    return density
 
 
 @njit(**COMPILED)
 def mixture_densities(points, log_h, m, whiteners, log_norms, shape, values, gradients, scratch):
     """`mixture_density` at many points (N, d): fill `values` (N,) and `gradients` (N, d)."""
-    n_components, d = m.shape
-    metric = _matrix_room(scratch, n_components, d, 0)
     for i in range(points.shape[0]):
         values[i] = mixture_density(
-            points[i], log_h, m, whiteners, log_norms, shape, gradients[i], metric, scratch
+            points[i], log_h, m, whiteners, log_norms, shape, gradients[i], scratch
         )
 
 
 @njit(**COMPILED)
-def solve_definite(matrix, right, out, whitener, y):
-    """Solve `matrix` · out = `right` for a positive definite matrix (d, d).
+def mixture_curvature(
+    a, log_h, m, whiteners, precisions, log_norms, shape, gradient, metric, hessian, scratch
+):
+    """Return log DMM(a); fill its gradient (d,), the metric and its Hessian, lower triangles.
 
-    Where it is nearly singular, only its diagonal counts.
+    With ρ_k the components' shares, g_k and c_k the factors of ∇ log D = g Σ⁻¹δ and of
+    ∇∇D / D = g Σ⁻¹ + c Σ⁻¹δ δᵀΣ⁻¹ (both of the same closed form, see `_log_donut`):
+
+        ∇ f = Σ ρ_k g_k Σ_k⁻¹δ_k
+        ∇∇f = Σ ρ_k (g_k Σ_k⁻¹ + c_k Σ_k⁻¹δ_k δ_kᵀΣ_k⁻¹) − ∇f ∇fᵀ
+
+    The metric is Σ ρ_k Σ_k⁻¹, the mean precision. Where the density is zero, gradient and Hessian
+    are zero and the metric the first component's. The components' shares are left in their room.
+    """
+    n_components, d = m.shape
+    _, value, slope, squared, _, direction = _component_rooms(scratch, n_components, d)
+    y = _vector_room(scratch, n_components, d, 0)
+    terms = _donut_terms(shape, d)
+    top = _log_donuts(a, log_h, m, whiteners, log_norms, terms, value, slope, squared, direction, y)
+    density = _shares(value, top)
+    for i in range(d):
+        gradient[i] = 0.0
+        for j in range(i + 1):
+            metric[i, j] = hessian[i, j] = 0.0
+    for k in range(n_components):
+        rho = value[k]
+        if rho == 0.0:
+            continue
+        weighted = rho * slope[k]
+        bend = rho * (terms[0] * terms[0] - (slope[k] + terms[0]) * (2.0 * terms[0] + terms[1]))
+        if top == -np.inf:
+            weighted = bend = 0.0
+        for i in range(d):
+            gradient[i] += weighted * direction[k, i]
+            bent = bend * direction[k, i]
+            for j in range(i + 1):
+                metric[i, j] += rho * precisions[k, i, j]
+                hessian[i, j] += weighted * precisions[k, i, j] + bent * direction[k, j]
+    for i in range(d):
+        for j in range(i + 1):
+            hessian[i, j] -= gradient[i] * gradient[j]
+    return density
+
+
+@njit(**COMPILED)
+def _factor(matrix, lower):
+    """Fill `lower` with L of L Lᵀ = `matrix`, of which the lower triangle is read.
+
+    Return False where it is not definite, or so nearly singular that one could not tell.
     """
     d = matrix.shape[0]
-    if d == 1:
-        out[0] = right[0] / matrix[0, 0]
-        return
-    if not math.isfinite(cholesky_whitener(matrix, whitener)):
-        # Of a step that only has to go uphill, the column's own scale is enough.
-        for i in range(d):
-            out[i] = right[i] / matrix[i, i]
-        return
     for i in range(d):
-        y[i] = 0.0
         for j in range(i + 1):
-            y[i] += whitener[i, j] * right[j]
-    for j in range(d):
-        out[j] = 0.0
-        for i in range(j, d):
-            out[j] += whitener[i, j] * y[i]
+            s = matrix[i, j]
+            for q in range(j):
+                s -= lower[i, q] * lower[j, q]
+            if i > j:
+                lower[i, j] = s / lower[j, j]
+            elif s > SINGULAR * abs(matrix[i, i]):
+                lower[i, i] = math.sqrt(s)
+            else:
+                return False
+    return True
+
+
+@njit(**COMPILED)
+def _forward(lower, right, out):
+    """Fill `out` with L⁻¹ `right`; return its squared length."""
+    squared = 0.0
+    for i in range(right.shape[0]):
+        s = right[i]
+        for j in range(i):
+            s -= lower[i, j] * out[j]
+        out[i] = s / lower[i, i]
+        squared += out[i] * out[i]
+    return squared
+
+
+@njit(**COMPILED)
+def _backward(lower, out):
+    """Overwrite `out` with L⁻ᵀ `out`."""
+    d = out.shape[0]
+    for i in range(d - 1, -1, -1):
+        s = out[i]
+        for j in range(i + 1, d):
+            s -= lower[j, i] * out[j]
+        out[i] = s / lower[i, i]
+
+
+@njit(**COMPILED)
+def _times(matrix, x, out):
+    """Fill `out` with a symmetric matrix, of which the lower triangle is read, times x."""
+    d = x.shape[0]
+    for i in range(d):
+        out[i] = 0.0
+        for j in range(i + 1):
+            out[i] += matrix[i, j] * x[j]
+        for j in range(i + 1, d):
+            out[i] += matrix[j, i] * x[j]
+
+
+# A step this close to the radius, as shares of it, is as good as one that is on it.
+NEAR_RADIUS = (0.7, 1.05)
+# Of the curvature in units of the metric, in which that of a Gaussian is 1.
+FIRST_SHIFT = 0.05
+# Shifts tried for one step: more only sharpen a step that is judged by what it gains anyway.
+MOST_SHIFTS = 12
+
+
+@njit(**COMPILED)
+def _trust_step(gradient, metric, hessian, norm, radius, step, shifted, lower, image):
+    """Fill `step` with the best of a quadratic model within `radius`; return its gain and length.
+
+    Maximises gᵀp + ½ pᵀH p over |p|_M ≤ radius (Moré & Sorensen, "Computing a trust region step",
+    1983): (λM − H) p = g with the smallest λ ≥ 0 that makes λM − H definite and p short enough,
+    found by Newton's iteration on 1/|p|. On a ridge, where H is singular, λ keeps the step short.
+    `norm` is the gradient's, in the inverse metric.
+    """
+    d = gradient.shape[0]
+    shift, least, most, length = 0.0, 0.0, np.inf, -1.0
+    for _ in range(MOST_SHIFTS):
+        for i in range(d):
+            for j in range(i + 1):
+                shifted[i, j] = shift * metric[i, j] - hessian[i, j]
+        if not _factor(shifted, lower):
+            least = shift
+            shift = max(4.0 * shift, FIRST_SHIFT) if most == np.inf else 0.5 * (least + most)
+            continue
+        _forward(lower, gradient, step)
+        _backward(lower, step)
+        _times(metric, step, image)
+        squared = 0.0
+        for i in range(d):
+            squared += step[i] * image[i]
+        length = math.sqrt(squared)
+        if length <= NEAR_RADIUS[1] * radius and (
+            shift == 0.0 or length >= NEAR_RADIUS[0] * radius or most - least < 1e-3 * most
+        ):
+            break
+        if length > radius:
+            least = shift
+        else:
+            most = shift
+        shift += (length / radius - 1.0) * squared / _forward(lower, image, image)
+        if not least < shift < most:
+            shift = 2.0 * least + FIRST_SHIFT if most == np.inf else 0.5 * (least + most)
+    if length < 0.0:  # nothing was definite: straight uphill
+        _factor(metric, lower)
+        _forward(lower, gradient, step)
+        _backward(lower, step)
+        length = norm
+    _times(hessian, step, image)
+    slope, bend = 0.0, 0.0
+    for i in range(d):
+        slope += step[i] * gradient[i]
+        bend += step[i] * image[i]
+    share = radius / length
+    if bend < 0.0:
+        # Not beyond the top of the model: it is at 1, but for a step that is straight uphill.
+        share = min(share, -slope / bend)
+    for i in range(d):
+        step[i] *= share
+    return share * slope + 0.5 * share * share * bend, share * length
 
 
 LONGEST_STEP = 0.5
 SHORTEST_STEP = 1e-7
 NUDGE = 1e-3
-MAX_ASCENT = 500
+MAX_ASCENT = 30
+# Deviations from the heaviest component: from further out a climb begins this far out of it.
+FAR = 10.0
+# Where the next step would gain no more than this log density, it is the last.
+LEVEL = 1e-9
+# Nearer to a donut's centre than this many deviations, its ridge is no circle to walk on.
+ROUND = 0.1
+
+
+@njit(**_INLINED)
+def _heaviest(shares):
+    """Return the component with the largest share."""
+    heaviest = 0
+    for k in range(1, shares.shape[0]):
+        if shares[k] > shares[heaviest]:
+            heaviest = k
+    return heaviest
 
 
 @njit(**COMPILED)
-def ascend(a, log_h, m, whiteners, log_norms, shape, scratch):
-    """Climb from `a` (overwritten) to a local maximum of the donut mixture; return its log density.
+def _bend_round(gradient, direction, offset, radius, precision, hessian):
+    """Turn a Hessian (lower triangle) into that of steps along circles about a donut's centre.
 
-    Gradient ascent in the metric of the components that matter where it stands, with backtracking.
-    No step is longer than half a standard deviation, so the climb stays on the hill it starts on;
-    only more than ten out, where there are no hills, it strides. At a centre the gradient vanishes
-    although the centre may be a pit: a start without a slope is moved by a thousandth of a standard
-    deviation.
+    With δ the offset from the centre, r its Mahalanobis distance, n = Σ⁻¹δ/r and g_r = gᵀδ/r, a
+    step p that goes round by p − (nᵀp) δ/r and out by nᵀp ends at a + p + a term of second order.
+    That term's gradient is what the Hessian gains:
+
+        H − (g_r/r)(Σ⁻¹ − n nᵀ) + ((g − g_r n) nᵀ + n (g − g_r n)ᵀ)/r
+    """
+    d = gradient.shape[0]
+    outward = 0.0
+    for i in range(d):
+        outward += gradient[i] * offset[i]
+    outward /= radius
+    for i in range(d):
+        n_i = direction[i] / radius
+        for j in range(i + 1):
+            n_j = direction[j] / radius
+            across = gradient[i] * n_j + n_i * gradient[j] - outward * n_i * n_j
+            hessian[i, j] += (across - outward * precision[i, j]) / radius
+
+
+@njit(**COMPILED)
+def _go_round(centre, offset, direction, radius, precision, step, out, image):
+    """Fill `out` with the end of a step along a circle about a donut's centre."""
+    d = step.shape[0]
+    outward, squared = 0.0, 0.0
+    _times(precision, step, image)
+    for i in range(d):
+        outward += direction[i] * step[i]
+        squared += image[i] * step[i]
+    outward /= radius
+    around = math.sqrt(max(squared - outward * outward, 0.0))
+    angle = around / radius
+    # sin(angle)/angle stays a number where nothing is gone round.
+    share = math.sin(angle) / angle if angle > 1e-8 else 1.0
+    along = (1.0 + outward / radius) * math.cos(angle)
+    for i in range(d):
+        tangent = step[i] - outward * offset[i] / radius
+        out[i] = centre[i] + along * offset[i] + (1.0 + outward / radius) * share * tangent
+
+
+@njit(**COMPILED)
+def ascend(a, log_h, m, whiteners, precisions, log_norms, shape, scratch):
+    """Climb from `a` (overwritten) to a local maximum of the donut mixture.
+
+    Returns the log density there and the number of densities that it took. Newton's ascent in a
+    trust region, in the metric of the components that matter where it stands, and along circles
+    about the centre of the heaviest, as its ridge runs. No step is longer than half a standard
+    deviation, so the climb stays on the hill it starts on; only more than ten out, where there are
+    no hills, it strides. It ends where the slope, or what is left to gain, is lost in rounding, and
+    so never walks along a level ridge. At a centre the gradient vanishes although the centre may be
+    a pit: a start without a slope is moved by a thousandth of a standard deviation.
     """
     n_components, d = m.shape
-    y = _vector_room(scratch, n_components, d, 0)
+    _, shares, _, squared, _, direction = _component_rooms(scratch, n_components, d)
+    offset = _vector_room(scratch, n_components, d, 7)
     gradient = _vector_room(scratch, n_components, d, 1)
     step = _vector_room(scratch, n_components, d, 2)
     trial = _vector_room(scratch, n_components, d, 3)
     trial_gradient = _vector_room(scratch, n_components, d, 4)
+    image = _vector_room(scratch, n_components, d, 5)
+    normal = _vector_room(scratch, n_components, d, 6)
     metric = _matrix_room(scratch, n_components, d, 0)
-    trial_metric = _matrix_room(scratch, n_components, d, 1)
-    whitener = _matrix_room(scratch, n_components, d, 2)
-    value = mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, metric, scratch)
-    solve_definite(metric, gradient, step, whitener, y)
-    squared = 0.0
-    for i in range(d):
-        squared += step[i] * gradient[i]
-    if squared < SHORTEST_STEP**2:
+    hessian = _matrix_room(scratch, n_components, d, 1)
+    trial_metric = _matrix_room(scratch, n_components, d, 2)
+    trial_hessian = _matrix_room(scratch, n_components, d, 3)
+    lower = _matrix_room(scratch, n_components, d, 4)
+    value = mixture_curvature(
+        a, log_h, m, whiteners, precisions, log_norms, shape, gradient, metric, hessian, scratch
+    )
+    _factor(metric, lower)
+    k = _heaviest(shares)
+    distance = math.sqrt(squared[k])
+    is_level = _forward(lower, gradient, image) < SHORTEST_STEP**2
+    if is_level or distance > FAR:
         for i in range(d):
-            a[i] += NUDGE / math.sqrt(metric[i, i])
-        value = mixture_density(a, log_h, m, whiteners, log_norms, shape, gradient, metric, scratch)
-    length = 1.0
-    for _ in range(MAX_ASCENT):
-        if value == -np.inf:
-            break
-        solve_definite(metric, gradient, step, whitener, y)
-        squared = 0.0
-        for i in range(d):
-            squared += step[i] * gradient[i]
-        norm = math.sqrt(max(squared, 0.0))
-        if norm < SHORTEST_STEP:
-            break
-        # In units of the slope: a longer last step may have become too short where it is gentler.
-        length = max(length, min(1.0, 10.0 * SHORTEST_STEP / norm))
-        length = min(length, max(LONGEST_STEP, 0.25 * norm - 2.0) / norm)
-        trial_value = -np.inf
-        while length * norm >= SHORTEST_STEP:
+            if is_level:
+                a[i] += NUDGE / math.sqrt(metric[i, i])
+            else:
+                a[i] = m[k, i] + FAR / distance * (a[i] - m[k, i])
+        value = mixture_curvature(
+            a, log_h, m, whiteners, precisions, log_norms, shape, gradient, metric, hessian, scratch
+        )
+    longest, moved = np.inf, True
+    for count in range(1, MAX_ASCENT):
+        if moved:
+            _factor(metric, lower)
+            norm = math.sqrt(_forward(lower, gradient, image))
+            if value == -np.inf or norm < SHORTEST_STEP:
+                return value, count
+            k = _heaviest(shares)
+            distance = math.sqrt(squared[k])
             for i in range(d):
-                trial[i] = a[i] + length * step[i]
-            trial_value = mixture_density(
-                trial,
-                log_h,
-                m,
-                whiteners,
-                log_norms,
-                shape,
-                trial_gradient,
-                trial_metric,
-                scratch,
-            )
-            if trial_value >= value + 0.1 * length * squared:
-                break
-            length *= 0.5
+                offset[i], normal[i] = a[i] - m[k, i], direction[k, i]
+            if d > 1 and distance > ROUND:
+                _bend_round(gradient, normal, offset, distance, precisions[k], hessian)
+        radius = min(longest, max(LONGEST_STEP, 0.8 * distance - 2.5))
+        gain, length = _trust_step(
+            gradient, metric, hessian, norm, radius, step, trial_hessian, lower, image
+        )
+        last = gain < LEVEL
+        if d > 1 and distance > ROUND:
+            _go_round(m[k], offset, normal, distance, precisions[k], step, trial, image)
         else:
-            break
-        # Barzilai–Borwein: the next length from the curvature just met, or twice as long if none.
-        curvature = 0.0
-        for i in range(d):
-            curvature += length * step[i] * (gradient[i] - trial_gradient[i])
-        length = length * length * squared / curvature if curvature > 0.0 else 2.0 * length
-        value = trial_value
-        for i in range(d):
-            a[i] = trial[i]
-            gradient[i] = trial_gradient[i]
-            for j in range(d):
-                metric[i, j] = trial_metric[i, j]
-    return value
+            for i in range(d):
+                trial[i] = a[i] + step[i]
+        trial_value = mixture_curvature(
+            trial,
+            log_h,
+            m,
+            whiteners,
+            precisions,
+            log_norms,
+            shape,
+            trial_gradient,
+            trial_metric,
+            trial_hessian,
+            scratch,
+        )
+        risen = trial_value - value
+        if last:
+            if risen > 0.0:
+                value = trial_value
+                for i in range(d):
+                    a[i] = trial[i]
+            return value, count + 1
+        moved = risen >= 0.1 * gain
+        if risen < 0.25 * gain:
+            longest = 0.3 * length
+        elif risen > 0.5 * gain:
+            longest = 2.0 * max(length, min(longest, radius))
+        if moved:
+            value = trial_value
+            for i in range(d):
+                a[i] = trial[i]
+                gradient[i] = trial_gradient[i]
+                for j in range(i + 1):
+                    metric[i, j] = trial_metric[i, j]
+                    hessian[i, j] = trial_hessian[i, j]
+    return value, MAX_ASCENT
 
 
 @njit(**COMPILED)
 def best_candidate(a, log_h, m, whiteners, lowers, log_norms, shape, ridge, scratch):
     """Overwrite `a` with the densest of the centres and the points on each component's ridge."""
     n_components, d = m.shape
-    _, value, slope, _, direction = _component_rooms(scratch, n_components, d)
+    _, value, slope, squared, _, direction = _component_rooms(scratch, n_components, d)
     y = _vector_room(scratch, n_components, d, 0)
     candidate = _vector_room(scratch, n_components, d, 3)
+    terms = _donut_terms(shape, d)
     best = -np.inf
     for k in range(n_components):
+        if log_h[k] == -np.inf and k > 0:
+            continue
         for c in range(2 * d + 1):
             axis = (c - 1) // 2
             sign = 0.0 if c == 0 else (1.0 if c % 2 == 1 else -1.0)
             for i in range(d):
                 candidate[i] = m[k, i] + sign * ridge * lowers[k, i, max(axis, 0)]
             top = _log_donuts(
-                candidate, log_h, m, whiteners, log_norms, shape, value, slope, direction, y
+                candidate,
+                log_h,
+                m,
+                whiteners,
+                log_norms,
+                terms,
+                value,
+                slope,
+                squared,
+                direction,
+                y,
             )
             # The sum is at most K times its largest term.
             if top + math.log(n_components) < best or top == -np.inf:
@@ -420,6 +658,35 @@ def best_candidate(a, log_h, m, whiteners, lowers, log_norms, shape, ridge, scra
                 best = density
                 for i in range(d):
                     a[i] = candidate[i]
+
+
+# A hill whose components weigh less than one demonstrated step in a million is gone.
+GONE = 1e-6
+
+
+@njit(**COMPILED)
+def climb(
+    a, log_h, m, whiteners, precisions, lowers, log_norms, shape, ridge, warm, jumps, scratch
+):
+    """Overwrite `a` with a mode; with `warm`, that of the hill on which `a` lies.
+
+    With `jumps`, a climb that ends on a hill whose components have next to no weight in this state,
+    wherever else it is dense, begins again at the best candidate. Such a hill is what an action is
+    left on when the state has moved away from the component that it followed.
+    """
+    if not warm:
+        best_candidate(a, log_h, m, whiteners, lowers, log_norms, shape, ridge, scratch)
+    ascend(a, log_h, m, whiteners, precisions, log_norms, shape, scratch)
+    if not (warm and jumps):
+        return
+    n_components, d = m.shape
+    shares = _component_rooms(scratch, n_components, d)[1]
+    weight = 0.0
+    for k in range(n_components):
+        weight += shares[k] * math.exp(log_h[k])
+    if weight < GONE:
+        best_candidate(a, log_h, m, whiteners, lowers, log_norms, shape, ridge, scratch)
+        ascend(a, log_h, m, whiteners, precisions, log_norms, shape, scratch)
 
 
 @njit(**COMPILED)
@@ -452,6 +719,7 @@ def answer(
     action_means,
     covariances,
     whiteners,
+    precisions,
     lowers,
     log_norms,
     scratch,
@@ -459,26 +727,35 @@ def answer(
     """Condition on `state`, choose ε, climb the donut mixture; overwrite `action`, return ε.
 
     With `warm` the climb starts from the `action` that comes in, otherwise from the best analytic
-    candidate. With `flat_stays` the action stays where it is if the density there is zero in double
-    precision. `printed` takes ε = 1/(1 + V/s²), the paper's formula as printed.
+    candidate. With `flat_stays` the action climbs the density itself, as in the paper's listing: it
+    stays where that is zero in double precision, and never jumps to another hill. `printed` takes
+    ε = 1/(1 + V/s²), the paper's formula as printed.
     """
     n_components, d = action_means.shape
-    h, _, _, m, _ = _component_rooms(scratch, n_components, d)
+    h, _, _, _, m, _ = _component_rooms(scratch, n_components, d)
     condition(state, state_constants, state_means, state_whiteners, gains, action_means, h, m)
     spread = scaled_variance(h, m, covariances, scale)
     exploration = exploration_of(spread, printed)
     shape, ridge = donut_shape(exploration, d, k, reach)
     for i in range(n_components):
-        h[i] = math.log(max(h[i], 1e-300))
-    if not warm:
-        best_candidate(action, h, m, whiteners, lowers, log_norms, shape, ridge, scratch)
-    elif flat_stays:
+        h[i] = math.log(h[i]) if h[i] > 0.0 else -np.inf
+    if warm and flat_stays:
         gradient = _vector_room(scratch, n_components, d, 1)
-        metric = _matrix_room(scratch, n_components, d, 0)
-        value = mixture_density(
-            action, h, m, whiteners, log_norms, shape, gradient, metric, scratch
-        )
+        value = mixture_density(action, h, m, whiteners, log_norms, shape, gradient, scratch)
         if math.exp(value) == 0.0:
             return exploration
-    ascend(action, h, m, whiteners, log_norms, shape, scratch)
+    climb(
+        action,
+        h,
+        m,
+        whiteners,
+        precisions,
+        lowers,
+        log_norms,
+        shape,
+        ridge,
+        warm,
+        not flat_stays,
+        scratch,
+    )
     return exploration

@@ -104,9 +104,9 @@ class DonutMixture:
         d = conditional.means.shape[1]
         self.shape = DonutShape.of(exploration, d, k, reach)
         self.ridge_radius = compiled.donut_shape(self.exploration, d, float(k), float(reach))[1]
-        self._log_h = np.log(np.maximum(conditional.weights, 1e-300))
+        with np.errstate(divide="ignore"):  # a component without weight is not there
+            self._log_h = np.log(conditional.weights)
         self._components = component_arrays(conditional.covariances)
-        self._scratch = compiled.scratch_for(*conditional.means.shape)
 
     def log_pdf(self, a: ArrayLike) -> Array:
         """Return the log density at points of shape (N, d), shape (N,); −inf where it is zero."""
@@ -126,34 +126,34 @@ class DonutMixture:
         return scaled
 
     def mode(self, start: ArrayLike | None = None) -> Array:
-        """Return a mode, shape (d,), by gradient ascent.
+        """Return a mode, shape (d,), by Newton's ascent in a trust region.
 
         Parameters
         ----------
         start : array-like, shape (d,), optional
             Where the climb begins (the paper's listing: the previous action), and so which of
             several modes is found. None begins at the best of the analytic candidates: the centres
-            m_k and the points m_k ± m*_k on their ridges.
+            m_k and the points m_k ± m*_k on their ridges. So does a climb that ends on a hill of
+            next to no weight (`compiled.GONE`).
         """
-        whiteners, lowers, log_norms = self._components
         means = self.conditional.means
-        if start is None:
-            a = np.empty(means.shape[1])
-            compiled.best_candidate(
-                a,
-                self._log_h,
-                means,
-                whiteners,
-                lowers,
-                log_norms,
-                self.shape,
-                self.ridge_radius,
-                self._scratch,
-            )
-        else:
-            a = self._points(np.array(start)[None])[0]
-        compiled.ascend(a, self._log_h, means, whiteners, log_norms, self.shape, self._scratch)
+        a = np.empty(means.shape[1]) if start is None else self._points(np.array(start)[None])[0]
+        compiled.climb(
+            a,
+            self._log_h,
+            means,
+            *self._components,
+            self.shape,
+            self.ridge_radius,
+            start is not None,
+            True,
+            self._scratch(),
+        )
         return a
+
+    def _scratch(self) -> Array:
+        """Return room to work in, for one call: several threads may ask one object."""
+        return compiled.scratch_for(*self.conditional.means.shape)
 
     def _points(self, a: ArrayLike) -> Array:
         return checked_points(a, self.conditional.means.shape[1])
@@ -161,7 +161,7 @@ class DonutMixture:
     def _evaluate(self, a: ArrayLike) -> tuple[Array, Array]:
         """Return the log density (N,) and its gradient (N, d) at points (N, d)."""
         points = self._points(a)
-        whiteners, _, log_norms = self._components
+        whiteners, _, _, log_norms = self._components
         values, gradients = np.empty(len(points)), np.empty_like(points)
         compiled.mixture_densities(
             points,
@@ -172,13 +172,13 @@ class DonutMixture:
             self.shape,
             values,
             gradients,
-            self._scratch,
+            self._scratch(),
         )
         return values, gradients
 
 
-def component_arrays(covariances: Array) -> tuple[Array, Array, Array]:
-    """Whiteners L⁻¹ (K, d, d), lower factors L (K, d, d) and log norms (K,) of covariances.
+def component_arrays(covariances: Array) -> tuple[Array, Array, Array, Array]:
+    """Whiteners L⁻¹, precisions, lower factors L (K, d, d) and log norms (K,) of covariances.
 
     Raises
     ------
@@ -191,4 +191,5 @@ def component_arrays(covariances: Array) -> tuple[Array, Array, Array]:
     if not compiled.precompute(np.ones(K), np.ascontiguousarray(covariances), whiteners, log_norms):
         raise MisstepError("a donut mixture's covariance is not symmetric positive definite")
     lowers = np.linalg.cholesky(covariances).astype(np.float64)
-    return whiteners, lowers, log_norms
+    precisions = whiteners.transpose(0, 2, 1) @ whiteners
+    return whiteners, np.ascontiguousarray(precisions), lowers, log_norms

@@ -15,6 +15,9 @@ Array = NDArray[np.float64]
 class DonutQuery:
     """A joint mixture made ready to be asked for the donut mixture's mode, in one compiled call.
 
+    It works in room of its own and allocates nothing, so one thread at a time may ask it: give each
+    thread a query of its own.
+
     Parameters
     ----------
     conditioner : Conditioner
