@@ -41,6 +41,8 @@ from misstep.errors import MisstepError
 from misstep.learners import LEARNERS, Task
 from misstep.parameters import ParameterValue, build_parameters
 from misstep.systems import make_system
+from misstep.systems.gymnasium_adapter import PREFIX
+from misstep.systems.recorded import system_kind
 
 QUICK, MOST_QUICK_TESTS = 50, 2
 """A quick study makes one repetition in so many, but at least one, and no more tests than this."""
@@ -285,6 +287,11 @@ def _read_case(entry: dict[str, Any]) -> list[Case]:
 def _built(case: Case, variant: dict[str, ParameterValue]) -> Case:
     """Return a variant of the case after building everything that it names."""
     parameters = {**case.parameters, **variant}
+    if system_kind(case.system).typed_only != frozenset() and not case.system.startswith(PREFIX):
+        raise MisstepError(
+            f"the system {case.system} is no simulation that a file may name: a study makes its "
+            "trials in simulations"
+        )
     system = make_system(case.system, **parameters)
     with _inside("test_set"):
         make_system(case.system, **{**parameters, **case.test_parameters})
