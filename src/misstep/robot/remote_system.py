@@ -147,8 +147,8 @@ class RemoteSystem(System):
         """Return a connection, and the parameters that the robot describes itself with."""
         if not self._address:
             raise MisstepError(
-                "remote: it has no address, so it can only be served, not driven; an address is never "
-                "taken from a file: give it"
+                "remote: it has no address, so it can only be served, not driven: give it, since "
+                "none is taken from a file"
             )
         link = open_link(self._address, _TIMEOUT)
         hello = {"token": os.environ.get(TOKEN, ""), "role": "drive", "version": VERSION}

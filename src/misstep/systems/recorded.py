@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from misstep.errors import MisstepError
-from misstep.parameters import ParameterValue, parameter_table
+from misstep.parameters import ParameterValue, build_parameters
 from misstep.systems.gymnasium_adapter import PREFIX, GymSystem
 from misstep.systems.judged import JUDGE_PARAMETERS
 from misstep.systems.system import System
@@ -47,19 +47,18 @@ def recorded_system(
     given = dict(given or {})
     judges = {row.name for row in JUDGE_PARAMETERS}
     if kind.typed_only is not None:
-        known = judges | {row.name for row in parameter_table(kind.parameters_type)}
-        if unknown := sorted(set(recorded) - known):
-            raise MisstepError(f"{name} has no parameter {unknown[0]!r}")
+        # Nothing that its constructor would take beside them, such as render_mode.
+        own = {key: recorded[key] for key in recorded if key not in judges}
+        build_parameters(kind.parameters_type, name, own)
         words = {key: recorded[key] for key in recorded if key not in kind.typed_only}
         return make_system(name, **{**words, **given})
     if not typed:
         raise MisstepError(
             f"{name} is not built from what a file says, since it may open files or connections"
         )
-    texts = {k for k, v in recorded.items() if isinstance(v, str) and k not in judges}
-    words = {key: recorded[key] for key in recorded if key not in texts}
+    words = {k: v for k, v in recorded.items() if k in judges or isinstance(v, bool | int | float)}
     system = make_system(name, **{**words, **given})
-    lacking = [key for key in differences(system, recorded) if key in texts - set(given)]
+    lacking = [k for k in differences(system, recorded) if k not in words and k not in given]
     if lacking:
         system.close()
         listed = ", ".join(f"{key}={recorded[key]!r}" for key in lacking)
