@@ -1,12 +1,13 @@
 """What a command leaves behind: tables on stdout, and a JSON file."""
 
+import os
 import sys
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from misstep.errors import MisstepError
-from misstep.storage import write_json
+from misstep.storage import is_stream, write_json
 from misstep.trajectory import Trajectory
 from misstep.version import __version__, command_line
 
@@ -27,7 +28,8 @@ def check_output_file(path: Path | None, option: str, *inputs: Path) -> None:
     Raises
     ------
     MisstepError
-        If it is a folder or one of the inputs, or no file can be made where it should go.
+        If it is a folder, one of the inputs or another recording, or no file can be made where it
+        should go.
     """
     if path is None:
         return
@@ -35,6 +37,42 @@ def check_output_file(path: Path | None, option: str, *inputs: Path) -> None:
         raise MisstepError(f"{option} {path} is a folder: name a file")
     if path.exists() and any(other.exists() and path.samefile(other) for other in inputs):
         raise MisstepError(f"{option} {path} is what is read, and would be lost: name another file")
+    if is_stream(path):
+        if not os.access(path, os.W_OK):
+            raise MisstepError(f"{option} {path}: it cannot be written to; name another file")
+        return
+    if path.exists() and _is_recording(path):
+        raise MisstepError(f"{option} {path} is a recording, and would be lost: name another file")
+    _check_folder(path, option)
+
+
+def check_new_recording(path: Path, option: str, *, force: bool) -> None:
+    """Make sure that a recording can be written, and that none is lost that is still wanted.
+
+    Raises
+    ------
+    MisstepError
+        If it exists and need not be replaced, is a folder, or cannot be made.
+    """
+    if path.is_dir():
+        raise MisstepError(f"{option} {path} is a folder: name a file")
+    if is_stream(path):
+        return
+    _check_folder(path, option)
+    if path.exists() and not force:
+        raise MisstepError(f"{option} {path} exists already: choose another name, or add --force")
+
+
+def _is_recording(path: Path) -> bool:
+    from misstep.formats import format_to_read
+
+    try:
+        return format_to_read(path).read is not None
+    except MisstepError:
+        return False
+
+
+def _check_folder(path: Path, option: str) -> None:
     try:
         tempfile.TemporaryFile(dir=path.parent).close()
     except OSError as error:
