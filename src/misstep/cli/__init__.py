@@ -2,7 +2,8 @@
 
     app.py            the commands put together, and what becomes of errors
     options.py        options that several commands share, and how their texts are read
-    output.py         tables and JSON files
+    output.py         JSON files, and what must not be written over
+    table.py          tables on stdout
     progress.py       a progress bar on a terminal, lines elsewhere
     interruption.py   what to do after a Ctrl-C
     record.py         demonstrate

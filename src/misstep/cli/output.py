@@ -1,17 +1,15 @@
-"""What a command leaves behind: tables on stdout, and a JSON file."""
+"""What a command leaves behind: a JSON file, and attempts in a table on stdout."""
 
 import os
-import sys
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from misstep.cli.table import print_table
 from misstep.errors import MisstepError
 from misstep.storage import is_stream, write_json
 from misstep.trajectory import Trajectory
 from misstep.version import __version__, command_line
-
-_WIDTH_OF_A_FILE = 240
 
 
 def check_output_file(path: Path | None, option: str, *inputs: Path) -> None:
@@ -87,22 +85,6 @@ def write_result(path: Path | None, result: Mapping[str, object]) -> None:
     if path is not None:
         origin = {"version": __version__, "command": list(command_line())}
         write_json(path, {**origin, **result})
-
-
-def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table; columns whose name starts with ``>`` are set to the right."""
-    from rich.box import SIMPLE
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=SIMPLE, pad_edge=False)
-    for column in columns:
-        right = column.startswith(">")
-        table.add_column(column.lstrip(">"), justify="right" if right else "left", overflow="fold")
-    for row in rows:
-        table.add_row(*row)
-    width = None if sys.stdout.isatty() else _WIDTH_OF_A_FILE
-    Console(markup=False, emoji=False, highlight=False, width=width).print(table)
 
 
 def print_attempts(name: str, attempts: Sequence[Trajectory]) -> None:
