@@ -144,6 +144,8 @@ def _explain(error: BaseException) -> tuple[str, int] | None:
         return f"error: {_usage(error)}", 2
     if isinstance(error, MisstepError):
         return f"error: {'' if _has_room() else 'out of memory: '}{error}", 2
+    if isinstance(error, UnicodeEncodeError):  # of a library that takes no bytes for a name
+        return "error: a name is no text in UTF-8, as this format needs it: rename what it names", 2
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return f"error: cannot write: {error.strerror}; free some room", 2
     # Libraries that are refused memory raise anything: ImportError, OSError, SystemError ...

@@ -228,9 +228,12 @@ def _check(numbered: Sequence[tuple[int, Trajectory]], system: System) -> Checke
     if not long:
         return Checked(reason=f"every episode is shorter than {FEWEST_ROWS} rows")
     try:
-        checks = check_equations([trajectory for _, trajectory in long], system)
+        with np.errstate(all="ignore"):  # a file may state masses of 10³⁰⁸ kg: nothing fits them
+            checks = check_equations([trajectory for _, trajectory in long], system)
     except MisstepError as error:
         return Checked(reason=str(error))
+    if not all(math.isfinite(c.residual) and math.isfinite(c.r_squared or 0.0) for c in checks):
+        return Checked(reason=f"{system.system_id} is beyond reckoning with its stated parameters")
     return Checked(tuple(replace(check, episode=long[check.episode][0]) for check in checks))
 
 

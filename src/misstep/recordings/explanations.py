@@ -105,6 +105,8 @@ def better_fits(
     tried = list(readings(slopes, mechanics, dt))
     left = [_unexplained(rows, mechanics, reading) for reading in tried]
     good = [i for i, value in enumerate(left) if value <= AS_GOOD * min(left)]
+    if not good:  # beyond reckoning, with a mass of 10³⁰⁸ kg
+        return []
     best = min(good, key=lambda i: (len(tried[i].changes), left[i]))
     reading, found = as_stated, []
     if left[best] < min(present / BETTER, MOST_UNEXPLAINED):
