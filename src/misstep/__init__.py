@@ -8,28 +8,27 @@
 2
 
 Everything public is a name of this package, imported when it is first used: the physics and the
-compiled loops take seconds to load, and ``misstep --help`` needs neither.
+compiled loops take seconds to load, and ``misstep --help`` needs neither; nor may a Ctrl-C meet a
+library that is being loaded before there is anybody to catch it.
 """
 
+import sys
 from importlib import import_module
-from typing import TYPE_CHECKING
-
-from misstep.errors import MisstepError
-
-# At once, because the module bears the function's name: imported later, by any other module, it
-# would take the function's place here.
-from misstep.rollout import Policy, rollout
-from misstep.trajectory import Column, Dataset, Outcome, Provenance, Trajectory
-from misstep.version import __version__
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from misstep.demonstrators import DEMONSTRATORS, demonstrate
+    from misstep.errors import MisstepError
     from misstep.formats import FORMATS, append_trajectory, load_dataset, save_dataset
     from misstep.learners import LEARNERS
     from misstep.learning import Evaluation, evaluate, learn, resume
     from misstep.mixture import Donut, DonutMixture, DonutShape, GaussianMixture
+    from misstep.rollout import Policy, rollout
     from misstep.runs import Run, load_run
     from misstep.systems import SYSTEMS, System, make_system
+    from misstep.trajectory import Column, Dataset, Outcome, Provenance, Trajectory
+    from misstep.version import __version__
 
 __all__ = [
     "DEMONSTRATORS",
@@ -65,12 +64,16 @@ __all__ = [
 
 _WHEN_USED = {
     "demonstrators": ("DEMONSTRATORS", "demonstrate"),
+    "errors": ("MisstepError",),
     "formats": ("FORMATS", "append_trajectory", "load_dataset", "save_dataset"),
     "learners": ("LEARNERS",),
     "learning": ("Evaluation", "evaluate", "learn", "resume"),
     "mixture": ("Donut", "DonutMixture", "DonutShape", "GaussianMixture"),
+    "rollout": ("Policy", "rollout"),
     "runs": ("Run", "load_run"),
     "systems": ("SYSTEMS", "System", "make_system"),
+    "trajectory": ("Column", "Dataset", "Outcome", "Provenance", "Trajectory"),
+    "version": ("__version__",),
 }
 _MODULE_OF = {name: module for module, names in _WHEN_USED.items() for name in names}
 
@@ -82,6 +85,18 @@ if not TYPE_CHECKING:  # a type checker would take it that every name exists
         value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
         globals()[name] = value
         return value
+
+
+class _Package(ModuleType):
+    """A package in which `rollout` stays the function when the module of that name is loaded."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "rollout" and isinstance(value, ModuleType):
+            value = value.rollout
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
 
 
 def __dir__() -> list[str]:

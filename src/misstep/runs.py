@@ -29,7 +29,9 @@ from misstep.formats import load_dataset, save_dataset
 from misstep.learners import LEARNERS, LearnedPolicy, Learner, Task
 from misstep.parameters import ParameterValue, build_parameters
 from misstep.storage import atomic_write, make_folder, read_json, write_json
-from misstep.systems import System, make_system
+from misstep.systems import System
+from misstep.systems.gymnasium_adapter import PREFIX
+from misstep.systems.recorded import differences, recorded_system
 from misstep.trajectory import Dataset, Outcome, Trajectory
 from misstep.version import __version__, command_line
 
@@ -86,9 +88,35 @@ class RunConfig:
     version: str = __version__
     command: tuple[str, ...] = field(default_factory=command_line)
 
-    def make_system(self) -> System:
-        """Build the system that the run drives."""
-        return make_system(self.system, **self.system_parameters)
+    def make_system(
+        self, given: Mapping[str, ParameterValue] | None = None, *, typed: str = ""
+    ) -> System:
+        """Build the system that the run drives.
+
+        Parameters
+        ----------
+        given : mapping, optional
+            Parameters of it that are not taken from a file.
+        typed : str
+            The system that the user names. Simulations need not be named, nor environments of
+            Gymnasium; anything else has to be, since the folder may be a stranger's: see
+            `recorded_system`.
+
+        Raises
+        ------
+        MisstepError
+            As `recorded_system`, or if the user names another system or gives other values than
+            the run was made with.
+        """
+        if typed and typed != self.system:
+            raise MisstepError(f"the run drives {self.system} and not {typed}")
+        recorded = self.system_parameters
+        named = bool(typed) or self.system.startswith(PREFIX)
+        system = recorded_system(self.system, recorded, given, typed=named)
+        if different := differences(system, recorded):
+            listed = ", ".join(f"{name}={recorded[name]!r}" for name in different)
+            raise MisstepError(f"the run was made with {listed}: it goes on with no other values")
+        return system
 
     def make_learner(self) -> Learner:
         """Build the learner with the run's parameters."""
@@ -189,13 +217,16 @@ class Run:
         return self
 
 
-def load_run(folder: str | os.PathLike[str]) -> Run:
+def load_run(folder: str | os.PathLike[str], *, system: System | None = None) -> Run:
     """Load a run from its folder.
 
     Parameters
     ----------
     folder : path
         As `learn` wrote it with ``out``.
+    system : System, optional
+        What the run drives. It is needed where that is no simulation: a run may be a stranger's,
+        and what its folder says opens no file and no connection.
 
     Returns
     -------
@@ -205,13 +236,15 @@ def load_run(folder: str | os.PathLike[str]) -> Run:
     Raises
     ------
     MisstepError
-        If the folder is no run or a file in it is damaged.
+        If the folder is no run or a file in it is damaged, or the system is needed.
     """
     path = Path(folder)
-    config = _load_config(path / CONFIG)
+    config = load_config(path)
     run = Run(config, load_dataset(path / DEMONSTRATIONS), folder=path)
     learner = LEARNERS[config.learner]
-    task = Task.of(config.make_system(), config.state).seen_from(learner.rung)
+    task = Task.of(config.make_system() if system is None else system, config.state).seen_from(
+        learner.rung
+    )
     files = (path / "trials").glob("trial_*.h5")
     for index, file in enumerate(sorted(files, key=lambda file: (len(file.stem), file.stem))):
         name = f"trial_{index:03d}"
@@ -230,9 +263,11 @@ def load_run(folder: str | os.PathLike[str]) -> Run:
     return run
 
 
-def _load_config(path: Path) -> RunConfig:
+def load_config(folder: Path) -> RunConfig:
+    """Load what determines the run of a folder; raise MisstepError where it is no run."""
+    path = folder / CONFIG
     if not path.exists():
-        raise MisstepError(f"{path.parent} is not a run folder: it has no {CONFIG}")
+        raise MisstepError(f"{folder} is not a run folder: it has no {CONFIG}")
     values = read_json(path)
     names = set(RunConfig.__dataclass_fields__)
     if not isinstance(values, dict) or set(values) != names:

@@ -13,8 +13,11 @@ import os
 import re
 import secrets
 import shutil
+import stat
+import sys
+import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +35,9 @@ def atomic_write(path: str | os.PathLike[str], write: Callable[[Path], object]) 
     that go by the suffix (pictures, videos, npz) see the right one, and a search for ``*.h5``
     never finds a file in the making.
 
+    What is no file cannot be replaced: a device or a pipe is written to plainly, and so is this
+    process's own output.
+
     Parameters
     ----------
     path : path
@@ -42,12 +48,14 @@ def atomic_write(path: str | os.PathLike[str], write: Callable[[Path], object]) 
     Raises
     ------
     MisstepError
-        If the system refuses: no such folder, no permission, a full disk. Whatever else `write`
-        raises passes through. In either case the old file is untouched.
+        If the system refuses: no such folder, no permission, a full disk; or if it is a folder, a
+        disk or a socket. Whatever else `write` raises passes through. In either case the old file
+        is untouched.
     """
+    if is_stream(path):
+        _write_plainly(path, write)
+        return
     target = Path(os.path.realpath(path))
-    if target.is_dir():
-        raise MisstepError(f"cannot write {path}: it is a folder; name a file")
     with refusals_told(path):
         with hidden_folder(target) as folder:
             temporary = folder / target.name
@@ -57,6 +65,62 @@ def atomic_write(path: str | os.PathLike[str], write: Callable[[Path], object]) 
             flush(temporary)
             temporary.replace(target)
         flush(target.parent)
+
+
+def is_stream(path: str | os.PathLike[str]) -> bool:
+    """Say whether `path` is written to plainly: a device, a pipe or this process's own output.
+
+    Raises
+    ------
+    MisstepError
+        If it is there but cannot be written to at all: a folder, a disk, a socket.
+    """
+    try:
+        status = os.stat(path)
+    except OSError:
+        return False
+    if stat.S_ISFIFO(status.st_mode) or stat.S_ISCHR(status.st_mode) or _output(status):
+        return True
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a disk or a socket"
+        raise MisstepError(f"cannot write {path}: it is {kind}; name a file")
+    return False
+
+
+def check_regular(path: str | os.PathLike[str]) -> None:
+    """Raise MisstepError if `path` is a device or a pipe: reading it might never end."""
+    with suppress(OSError):
+        mode = os.stat(path).st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise MisstepError(f"cannot read {path}: it is a device or a pipe; name a file")
+
+
+def _output(status: os.stat_result) -> int:
+    """Return the descriptor of this process's output or errors that is this very file, or 0."""
+    for descriptor in (1, 2):
+        with suppress(OSError):
+            if os.path.samestat(status, os.fstat(descriptor)):
+                return descriptor
+    return 0
+
+
+def _write_plainly(path: str | os.PathLike[str], write: Callable[[Path], object]) -> None:
+    with tempfile.TemporaryDirectory() as folder, refusals_told(path):
+        temporary = Path(folder, Path(path).name)
+        write(temporary)
+        own = _output(os.stat(path))
+        if own and sys.stdout is not None:
+            sys.stdout.flush()  # what was printed before comes first
+        # Its own output is not opened anew: that would begin at the start of the file again.
+        with (
+            open(temporary, "rb") as source,
+            open(os.dup(own) if own else path, "wb", buffering=0) as stream,
+        ):
+            try:
+                shutil.copyfileobj(source, stream)
+            except BrokenPipeError:
+                if not own:
+                    raise
 
 
 @contextmanager
@@ -84,12 +148,14 @@ def _take_away() -> None:
 def write_text(path: str | os.PathLike[str], text: str) -> None:
     r"""Write a text file in UTF-8 in a single step, with ``\n`` at the ends of lines.
 
+    What is no text, as a file's name can be, becomes ``?``.
+
     Raises
     ------
     MisstepError
         As `atomic_write`.
     """
-    atomic_write(path, lambda temporary: temporary.write_bytes(text.encode()))
+    atomic_write(path, lambda temporary: temporary.write_bytes(text.encode(errors="replace")))
 
 
 def write_json(path: str | os.PathLike[str], value: object, *, sort_keys: bool = False) -> None:
@@ -123,8 +189,9 @@ def read_json(path: Path) -> Any:
     Raises
     ------
     MisstepError
-        If it is missing, larger than 64 MiB, or no JSON.
+        If it is missing, no file, larger than 64 MiB, or no JSON.
     """
+    check_regular(path)
     try:
         if path.stat().st_size > _LARGEST_JSON:
             raise MisstepError(f"{path} is too large: more than {_LARGEST_JSON} bytes of JSON")

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
-from misstep.systems import SYSTEMS, make_system
+from misstep.systems import SYSTEMS, recorded_system
 from misstep.systems.gymnasium_adapter import PREFIX
 from misstep.trajectory import Dataset
 
@@ -95,7 +95,7 @@ def _system_limits(dataset: Dataset) -> ActionLimits | str:
     if name not in SYSTEMS and not name.startswith(PREFIX):
         return f"the system {name!r} is not known here" if name else "the system is not named"
     try:
-        system = make_system(name, **parameters)
+        system = recorded_system(name, parameters)
     except MisstepError as error:
         return f"the system cannot be built ({error})"
     try:

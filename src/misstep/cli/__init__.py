@@ -1,8 +1,10 @@
 """The command line, ``misstep``: one file a group of commands.
 
     app.py            the commands put together, and what becomes of errors
+    streams.py        what is printed through
     options.py        options that several commands share, and how their texts are read
-    output.py         tables and JSON files
+    output.py         JSON files, and what must not be written over
+    table.py          tables on stdout
     progress.py       a progress bar on a terminal, lines elsewhere
     interruption.py   what to do after a Ctrl-C
     record.py         demonstrate
@@ -21,9 +23,31 @@
     catalogue.py      list
 
 A command imports what it needs when it runs: ``misstep --help`` must not wait for the physics and
-the compiled loops. It returns its exit code.
+the compiled loops. It returns its exit code. This file itself imports next to nothing, so that a
+Ctrl-C finds somebody who knows what to do from the first moment on.
 """
 
-from misstep.cli.app import main
+import sys
+from collections.abc import Sequence
+
+from misstep.cli.interruption import ending_at_once
 
 __all__ = ["main"]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Words after ``misstep``; those that the process was started with if left out.
+
+    Returns
+    -------
+    int
+        The exit code.
+    """
+    with ending_at_once():
+        from misstep.cli.app import run
+    return run(list(sys.argv[1:] if arguments is None else arguments))

@@ -4,7 +4,7 @@
 code meaning
 ==== ==============================================================================
 0    the command did what it claims
-1    it ran, and did not: no trial succeeded; or nobody read its output to the end
+1    it ran, and did not: no trial succeeded
 2    bad input, or out of memory or disk: one line on stderr says what, where, and what
      would be right
 130  interrupted with Ctrl-C
@@ -13,7 +13,6 @@ code meaning
 """
 
 import errno
-import io
 import os
 import sys
 from collections.abc import Sequence
@@ -39,6 +38,7 @@ from misstep.cli import (
     study,
 )
 from misstep.cli.interruption import Terminated, interruptible
+from misstep.cli.streams import forgiving_output
 from misstep.errors import MisstepError
 from misstep.version import __version__
 
@@ -108,36 +108,21 @@ for _group, _help, _members in ros.GROUPS:
     app.add_typer(_commands, name=_group)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Words after ``misstep``; those that the process was started with if left out.
-
-    Returns
-    -------
-    int
-        The exit code.
-    """
-    with interruptible():
-        return _run(list(sys.argv[1:] if arguments is None else arguments))
+def run(words: Sequence[str]) -> int:
+    """Run a command, and return its exit code."""
+    with interruptible(), forgiving_output():
+        return _run(list(words))
 
 
 def _run(words: list[str]) -> int:
     try:
-        _replace_unprintable()
         command = typer.main.get_command(app)
-        # Not `app(...)`, which has its own ideas of interrupts, closed pipes and tracebacks.
+        # Not `app(...)`, which has its own ideas of interrupts and tracebacks.
         with command.make_context("misstep", words) as context:
             code = command.invoke(context)
         sys.stdout.flush()
     except typer.Exit as exit_:
         return exit_.exit_code
-    except BrokenPipeError:
-        _drop_output()
-        return 1
     except (Exception, KeyboardInterrupt) as error:
         told = _explain(error)
         if told is None:
@@ -159,6 +144,8 @@ def _explain(error: BaseException) -> tuple[str, int] | None:
         return f"error: {_usage(error)}", 2
     if isinstance(error, MisstepError):
         return f"error: {'' if _has_room() else 'out of memory: '}{error}", 2
+    if isinstance(error, UnicodeEncodeError):  # of a library that takes no bytes for a name
+        return "error: a name is no text in UTF-8, as this format needs it: rename what it names", 2
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return f"error: cannot write: {error.strerror}; free some room", 2
     # Libraries that are refused memory raise anything: ImportError, OSError, SystemError ...
@@ -203,10 +190,3 @@ def _usage(error: typer.TyperException) -> str:
     if context is None:
         return message
     return f"{message}; see `{context.command_path} --help`"
-
-
-def _replace_unprintable() -> None:
-    """Print ``?`` on a terminal that cannot show a letter, rather than fail."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")

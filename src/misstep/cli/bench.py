@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from misstep.cli.options import JsonFile, Seed
-from misstep.cli.output import check_output_file, print_table, write_result
+from misstep.cli.output import check_output_file, write_result
 from misstep.cli.progress import progress
+from misstep.cli.table import print_table
 
 if TYPE_CHECKING:
     from misstep.bench.run import Bench

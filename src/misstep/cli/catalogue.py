@@ -6,7 +6,8 @@ from typing import Annotated, Any
 import typer
 
 from misstep.cli.options import JsonFile
-from misstep.cli.output import check_output_file, print_table, write_result
+from misstep.cli.output import check_output_file, write_result
+from misstep.cli.table import print_table
 from misstep.errors import MisstepError
 from misstep.parameters import ParameterRow, parameter_table
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from misstep.cli.options import JsonFile, SystemParameters, parse_parameters
-from misstep.cli.output import check_output_file, write_result
+from misstep.cli.output import check_new_recording, check_output_file, write_result
 from misstep.cli.progress import progress
 from misstep.errors import MisstepError
 
@@ -196,10 +196,10 @@ def convert(
     target = format_of(out, format_)
     check_output_file(json, "--json", *paths)
     check_output_file(save_mapping, "--save-mapping", *paths)
-    if Path(located(out)).exists() and not force:
-        raise MisstepError(f"{out} exists already: choose another name, or add --force")
     if not target.is_folder:
-        check_output_file(out, "OUT")
+        check_new_recording(out, "OUT", force=force)
+    elif Path(located(out)).exists() and not force:
+        raise MisstepError(f"{out} exists already: choose another name, or add --force")
     summary, beginnings = Summary(), _beginnings(plan)
     with progress("converting") as report:
         episodes = planned(

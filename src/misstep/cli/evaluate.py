@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from misstep.cli.options import JsonFile, Seed, parse_parameters
+from misstep.cli.options import JsonFile, RunSystem, Seed, run_system
 from misstep.cli.output import check_output_file, write_result
 from misstep.cli.progress import progress
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 def evaluate(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of `misstep learn --out`.")],
     episodes: Annotated[int, typer.Option(help="How many episodes to run.")] = 100,
+    system: RunSystem = None,
     set_: Annotated[
         list[str] | None,
         typer.Option(
@@ -38,18 +39,17 @@ def evaluate(
     """
     import misstep
 
-    given = parse_parameters("--set", set_)
     check_output_file(json, "--json")
-    loaded = misstep.load_run(run)
+    driven = run_system(run, system, set_, instead=True)
+    loaded = misstep.load_run(run, system=None if system is None else driven)
     config, policy = loaded.config, loaded.policy
-    system = misstep.make_system(config.system, **{**config.system_parameters, **given})
     with progress("episode") as report:
         counting = _CountingPolicy(policy, lambda started: report(started - 1, episodes, ""))
-        outcome = misstep.evaluate(system, counting, episodes=episodes, seed=seed)
+        outcome = misstep.evaluate(driven, counting, episodes=episodes, seed=seed)
     low, high = outcome.interval_95
     learner = asdict(config.make_learner())  # type: ignore[call-overload]
     result = {
-        "parameters": {"system": system.parameters, "learner": learner},
+        "parameters": {"system": driven.parameters, "learner": learner},
         "run": str(run),
         "learner": config.learner,
         "system": config.system,

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from misstep.cli.options import JsonFile, Seed, parse_names
-from misstep.cli.output import check_output_file, formatted, print_table, write_result
+from misstep.cli.output import check_output_file, formatted, write_result
 from misstep.cli.progress import progress
+from misstep.cli.table import print_table
 
 if TYPE_CHECKING:
     from misstep.inspection import Inspection

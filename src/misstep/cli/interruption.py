@@ -11,6 +11,7 @@ from pathlib import Path
 from types import FrameType
 
 _AGAIN = 0.01  # s
+_INTERRUPTED = 130
 
 
 class Terminated(KeyboardInterrupt):
@@ -41,6 +42,24 @@ def interruptible() -> Iterator[None]:
 
 
 @contextmanager
+def ending_at_once() -> Iterator[None]:
+    """Let a Ctrl-C end the process at once while nothing has begun in it yet.
+
+    An exception would be raised in the middle of some library's import, which may make anything
+    of it.
+    """
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    signal.signal(signal.SIGINT, _end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@contextmanager
 def resumable(folder: Path, configuration: str, command: str = "resume") -> Iterator[None]:
     """Say how to go on when the block is interrupted, once there is something to go on with.
 
@@ -60,6 +79,11 @@ def resumable(folder: Path, configuration: str, command: str = "resume") -> Iter
             resuming = f"`misstep {command} {shlex.quote(str(folder))}` goes on"
             raise type(interrupt)(resuming) from interrupt
         raise
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    os.write(2, b"misstep: interrupted\n")
+    os._exit(_INTERRUPTED)
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:

@@ -13,12 +13,15 @@ from misstep.cli.options import (
     Failure,
     JsonFile,
     LearnerParameters,
+    RunParameters,
+    RunSystem,
     Seed,
     Success,
     SystemName,
+    demonstrated_system,
     parse_names,
     parse_parameters,
-    recorded_parameters,
+    run_system,
     system_parameters,
 )
 from misstep.cli.output import check_output_file, print_attempts, write_result
@@ -95,7 +98,7 @@ def learn(
     if learner is not None:
         misstep.LEARNERS[learner]  # an unknown name is told before anything is read
     shown = misstep.load_dataset(demonstrations)
-    driven = misstep.make_system(system, **recorded_parameters(system, shown, given))
+    driven = demonstrated_system(system, shown, given)
     if learner is None:
         task = Task.of(driven, parse_names(state))
         learner, why = default_learner(task, shown)
@@ -127,6 +130,8 @@ def resume(
             metavar="FOLDER", help="Of `misstep learn`, `misstep reproduce` or `misstep study`."
         ),
     ],
+    system: RunSystem = None,
+    set_: RunParameters = None,
     json: JsonFile = None,
 ) -> int:
     """Go on after a crash or a Ctrl-C.
@@ -145,10 +150,11 @@ def resume(
         from misstep.cli.study import resume_study
 
         return resume_study(folder, json)
-    run = misstep.load_run(folder)
+    driven = run_system(folder, system, set_)
+    run = misstep.load_run(folder, system=driven)
     with progress("trial") as report, resumable(folder, CONFIG):
         report(len(run.trials), run.config.max_trials, "")
-        misstep.resume(run, on_trial=_reporter(report))
+        misstep.resume(run, system=driven, on_trial=_reporter(report))
     return _conclude(run, json)
 
 

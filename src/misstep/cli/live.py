@@ -1,5 +1,6 @@
 """``misstep live``: fail by hand, and watch it learn."""
 
+import sys
 import threading
 import webbrowser
 from pathlib import Path
@@ -43,9 +44,9 @@ def live(
     try:
         from misstep.live import server
     except ImportError as error:
-        raise MisstepError(
-            f"the live page needs {error.name}: install it with `pip install 'misstep[live]'`"
-        ) from error
+        standard = (error.name or "").partition(".")[0] in sys.stdlib_module_names
+        way = "use a Python that has it" if standard else "pip install 'misstep[live]'"
+        raise MisstepError(f"the live page needs {error.name}: {way}") from error
     import misstep
 
     parameters = parse_parameters("--set", set_)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from misstep.cli.options import JsonFile
-from misstep.cli.output import check_output_file, formatted, print_table, write_result
+from misstep.cli.output import check_output_file, formatted, write_result
+from misstep.cli.table import print_table
 from misstep.errors import MisstepError
 from misstep.trajectory import Dataset, Outcome
 

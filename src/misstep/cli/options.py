@@ -11,6 +11,7 @@ from misstep.errors import MisstepError
 from misstep.parameters import ParameterValue
 
 if TYPE_CHECKING:
+    from misstep.systems import System
     from misstep.trajectory import Dataset
 
 SystemName = Annotated[
@@ -64,6 +65,25 @@ Cost = Annotated[
     ),
 ]
 Seed = Annotated[int, typer.Option(help="Same seed, same result.")]
+RunSystem = Annotated[
+    str | None,
+    typer.Option(
+        "--system",
+        metavar="NAME",
+        help="What the run drives, where that is no simulation: such a system is only built of "
+        "what you say yourself.",
+        show_default=False,
+    ),
+]
+RunParameters = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="A parameter of that system, or the address of a robot; repeatable.",
+        show_default=False,
+    ),
+]
 JsonFile = Annotated[
     Path | None,
     typer.Option("--json", metavar="FILE", help="Write the result to this file too, as JSON."),
@@ -136,19 +156,28 @@ def system_parameters(
     return values
 
 
-def recorded_parameters(
-    system: str, demonstrations: "Dataset", given: Mapping[str, ParameterValue]
-) -> dict[str, ParameterValue]:
-    """Return what was recorded with demonstrations of the same system, and over it what is given.
+def demonstrated_system(
+    name: str, demonstrations: "Dataset", given: Mapping[str, ParameterValue]
+) -> "System":
+    """Build the system that the user names, as demonstrations of it were recorded.
+
+    Parameters
+    ----------
+    name : str
+    demonstrations : Dataset
+    given : mapping
+        Parameters that the user gives, in place of recorded ones.
 
     Raises
     ------
     MisstepError
-        If the demonstrations disagree on a parameter that is not given.
+        If the demonstrations disagree on a parameter that is not given, or as `recorded_system`.
     """
+    from misstep.systems import make_system, recorded_system
+
     origins = [attempt.provenance for attempt in demonstrations]
-    if any(origin.system != system for origin in origins):
-        return dict(given)
+    if any(origin.system != name for origin in origins):
+        return make_system(name, **given)
     names = sorted({name for origin in origins for name in origin.parameters} - set(given))
     differing = [n for n in names if len({origin.parameters.get(n) for origin in origins}) > 1]
     if differing:
@@ -156,7 +185,48 @@ def recorded_parameters(
             f"the demonstrations were recorded with different values of {', '.join(differing)}: "
             "give each with --set"
         )
-    return {**origins[0].parameters, **given}
+    return recorded_system(name, origins[0].parameters, given, typed=True)
+
+
+def run_system(
+    folder: Path,
+    name: str | None,
+    set_: Sequence[str] | None,
+    *,
+    instead: bool = False,
+) -> "System":
+    """Build the system of a run: simulations as its folder says, anything else as the user does.
+
+    Parameters
+    ----------
+    folder : Path
+    name : str or None
+        What the user says it drives.
+    set_ : sequence of str or None
+        Texts of ``--set``.
+    instead : bool
+        Whether these may differ from what the run was made with.
+
+    Raises
+    ------
+    MisstepError
+        If the folder is no run, the user has to name its system, or as `RunConfig.make_system`.
+    """
+    from misstep.runs import load_config
+    from misstep.systems.gymnasium_adapter import PREFIX
+    from misstep.systems.recorded import recorded_system, system_kind
+
+    config, given = load_config(folder), parse_parameters("--set", set_)
+    named = name is not None or config.system.startswith(PREFIX)
+    if not named and system_kind(config.system).typed_only is None:
+        raise MisstepError(
+            f"the run {folder} drives {config.system}, which is not built from what a file says, "
+            f"since it may open files or connections: name it, --system {config.system}, and with "
+            "--set what of its parameters is a text"
+        )
+    if instead:
+        return recorded_system(config.system, config.system_parameters, given, typed=named)
+    return config.make_system(given, typed=name or "")
 
 
 def parse_names(text: str | None) -> tuple[str, ...] | None:

@@ -1,16 +1,15 @@
-"""What a command leaves behind: tables on stdout, and a JSON file."""
+"""What a command leaves behind: a JSON file, and attempts in a table on stdout."""
 
-import sys
+import os
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from misstep.cli.table import print_table
 from misstep.errors import MisstepError
-from misstep.storage import write_json
+from misstep.storage import is_stream, write_json
 from misstep.trajectory import Trajectory
 from misstep.version import __version__, command_line
-
-_WIDTH_OF_A_FILE = 240
 
 
 def check_output_file(path: Path | None, option: str, *inputs: Path) -> None:
@@ -27,7 +26,8 @@ def check_output_file(path: Path | None, option: str, *inputs: Path) -> None:
     Raises
     ------
     MisstepError
-        If it is a folder or one of the inputs, or no file can be made where it should go.
+        If it is a folder, one of the inputs or another recording, or no file can be made where it
+        should go.
     """
     if path is None:
         return
@@ -35,6 +35,42 @@ def check_output_file(path: Path | None, option: str, *inputs: Path) -> None:
         raise MisstepError(f"{option} {path} is a folder: name a file")
     if path.exists() and any(other.exists() and path.samefile(other) for other in inputs):
         raise MisstepError(f"{option} {path} is what is read, and would be lost: name another file")
+    if is_stream(path):
+        if not os.access(path, os.W_OK):
+            raise MisstepError(f"{option} {path}: it cannot be written to; name another file")
+        return
+    if path.exists() and _is_recording(path):
+        raise MisstepError(f"{option} {path} is a recording, and would be lost: name another file")
+    _check_folder(path, option)
+
+
+def check_new_recording(path: Path, option: str, *, force: bool) -> None:
+    """Make sure that a recording can be written, and that none is lost that is still wanted.
+
+    Raises
+    ------
+    MisstepError
+        If it exists and need not be replaced, is a folder, or cannot be made.
+    """
+    if path.is_dir():
+        raise MisstepError(f"{option} {path} is a folder: name a file")
+    if is_stream(path):
+        return
+    _check_folder(path, option)
+    if path.exists() and not force:
+        raise MisstepError(f"{option} {path} exists already: choose another name, or add --force")
+
+
+def _is_recording(path: Path) -> bool:
+    from misstep.formats import format_to_read
+
+    try:
+        return format_to_read(path).read is not None
+    except MisstepError:
+        return False
+
+
+def _check_folder(path: Path, option: str) -> None:
     try:
         tempfile.TemporaryFile(dir=path.parent).close()
     except OSError as error:
@@ -49,22 +85,6 @@ def write_result(path: Path | None, result: Mapping[str, object]) -> None:
     if path is not None:
         origin = {"version": __version__, "command": list(command_line())}
         write_json(path, {**origin, **result})
-
-
-def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table; columns whose name starts with ``>`` are set to the right."""
-    from rich.box import SIMPLE
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=SIMPLE, pad_edge=False)
-    for column in columns:
-        right = column.startswith(">")
-        table.add_column(column.lstrip(">"), justify="right" if right else "left", overflow="fold")
-    for row in rows:
-        table.add_row(*row)
-    width = None if sys.stdout.isatty() else _WIDTH_OF_A_FILE
-    Console(markup=False, emoji=False, highlight=False, width=width).print(table)
 
 
 def print_attempts(name: str, attempts: Sequence[Trajectory]) -> None:

@@ -17,9 +17,8 @@ from misstep.cli.options import (
     parse_parameters,
     system_parameters,
 )
-from misstep.cli.output import check_output_file, print_attempts, write_result
+from misstep.cli.output import check_new_recording, check_output_file, print_attempts, write_result
 from misstep.cli.progress import progress
-from misstep.errors import MisstepError
 from misstep.parameters import build_parameters
 
 
@@ -46,12 +45,14 @@ def demonstrate(
 ) -> int:
     """Record failed demonstrations of a system."""
     import misstep
+    from misstep.formats import format_of
 
     given: dict[str, Any] = parse_parameters("--with", with_)
     demonstrator = build_parameters(misstep.DEMONSTRATORS[by], f"demonstrator {by}", given)
     judged = system_parameters(set_, success=success, failure=failure, cost=cost)
     driven = misstep.make_system(system, **judged)
-    _check_out(out, force)
+    format_of(out)
+    check_new_recording(out, "--out", force=force)
     check_output_file(json, "--json")
     with progress("demonstrating"):
         dataset = misstep.demonstrate(driven, by, n, seed, **given)
@@ -72,15 +73,6 @@ def demonstrate(
     print_attempts("episode", dataset)
     print(f"{len(dataset)} failed demonstrations in {out}")
     return 0
-
-
-def _check_out(out: Path, force: bool) -> None:
-    from misstep.formats import format_of
-
-    format_of(out)
-    check_output_file(out, "--out")
-    if out.exists() and not force:
-        raise MisstepError(f"--out {out} exists already: choose another name, or add --force")
 
 
 COMMANDS = [

@@ -23,6 +23,7 @@ from misstep.cli.options import (
     parse_names,
     parse_pairs,
     parse_parameters,
+    run_system,
     system_parameters,
 )
 from misstep.cli.output import check_output_file, print_attempts, write_result
@@ -191,7 +192,14 @@ def explore(
     context: typer.Context,
     folder: ServedRun,
     demonstrations: NewRunFrom = None,
-    system: Annotated[str, typer.Option(metavar="NAME", help="Of a new run.")] = "cartpole",
+    system: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Of a new run, or of one whose system is no simulation.",
+            show_default="cartpole",
+        ),
+    ] = None,
     set_: SystemParameters = None,
     success: Success = None,
     failure: Failure = None,
@@ -239,10 +247,10 @@ def explore(
     with ExitStack() as stack:
         bus = stack.enter_context(closing(_open_bus(context, "exploration")))
         if demonstrations is None:
-            run = load_run(folder)
-            described = run.config.make_system()
+            described = run_system(folder, system, set_)
+            run = load_run(folder, system=described)
         else:
-            described = _make_system(system, set_, success, failure, cost)
+            described = _make_system(system or "cartpole", set_, success, failure, cost)
             run = _begin(
                 folder,
                 _wait_for(demonstrations, patience),

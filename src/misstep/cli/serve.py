@@ -22,9 +22,10 @@ from misstep.cli.options import (
     NewRunLearner,
     ServedRun,
     Success,
+    demonstrated_system,
     parse_names,
     parse_parameters,
-    recorded_parameters,
+    run_system,
     system_parameters,
 )
 from misstep.cli.output import check_output_file, print_attempts, write_result
@@ -46,7 +47,11 @@ def serve(
     demonstrations: NewRunFrom = None,
     system: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Of a new run: the system that describes the robot."),
+        typer.Option(
+            metavar="NAME",
+            help="The system that describes the robot: of a new run, or of one whose system is no "
+            "simulation.",
+        ),
     ] = None,
     set_: Annotated[
         list[str] | None,
@@ -129,9 +134,10 @@ def serve(
     safety = Safety(watchdog_ms / 1e3, deadline_ms / 1e3, dry_run)
     judges = {"success": success, "failure": failure, "cost": cost}
     if demonstrations is None:
-        given = {"--system": system, "--set": set_, "--with": with_, "--learner": learner}
-        _refuse(folder, {**given, "--state": state, **{f"--{k}": v for k, v in judges.items()}})
-        run, robot = _load(folder, keep_policy)
+        given = {"--with": with_, "--learner": learner, "--state": state}
+        _refuse(folder, {**given, **{f"--{k}": v for k, v in judges.items()}})
+        robot = run_system(folder, system, set_)
+        run = _load(folder, robot, keep_policy)
     else:
         run, robot = _begin(
             demonstrations,
@@ -199,13 +205,13 @@ def _refuse(folder: Path, given: Mapping[str, object]) -> None:
             raise MisstepError(f"{option} is for a new run, with --from; {folder} says its own")
 
 
-def _load(folder: Path, keep_policy: bool) -> tuple["Run", "System"]:
+def _load(folder: Path, robot: "System", keep_policy: bool) -> "Run":
     from misstep.runs import load_run
 
-    run = load_run(folder)
+    run = load_run(folder, system=robot)
     if run.finished and not keep_policy:
         raise MisstepError(f"the run {folder} is finished; --keep-policy drives with its policy")
-    return run, run.config.make_system()
+    return run
 
 
 def _begin(
@@ -222,7 +228,7 @@ def _begin(
     if system is None:
         raise MisstepError("--from begins a new run: give --system, what describes the robot")
     shown = misstep.load_dataset(demonstrations)
-    robot = misstep.make_system(system, **recorded_parameters(system, shown, given))
+    robot = demonstrated_system(system, shown, given)
     return begin(robot, shown, learner, **options), robot
 
 

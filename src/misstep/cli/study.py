@@ -7,8 +7,9 @@ import typer
 
 from misstep.cli.interruption import resumable
 from misstep.cli.options import JsonFile
-from misstep.cli.output import check_output_file, print_table, write_result
+from misstep.cli.output import check_output_file, write_result
 from misstep.cli.progress import progress
+from misstep.cli.table import print_table
 
 if TYPE_CHECKING:
     from misstep.study import Study

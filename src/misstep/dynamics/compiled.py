@@ -17,9 +17,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from misstep.compiling import njit
 from misstep.costs import EFFORT, FREE_SHARE, WALL, StateCost
 from misstep.errors import MisstepError
 from misstep.mixture.elementary import REORDER, exp_nonpositive

@@ -25,6 +25,7 @@ from misstep.formats.format import (
 )
 from misstep.formats.guard import guarded, prefixed
 from misstep.registry import Registry
+from misstep.storage import check_regular
 from misstep.trajectory import Dataset, Trajectory
 
 __all__ = [
@@ -174,9 +175,25 @@ def _reader(path: str | os.PathLike[str], name: str | None) -> Read:
     source = format_to_read(path, name)
     if source.read is None:
         raise MisstepError(f"{path}: {source.description} is only written, not read")
-    if not os.path.exists(minari.located(path)):
+    place = minari.located(path)
+    if not os.path.exists(place):
         raise MisstepError(f"cannot read {path}: there is no such file")
+    for file in _files(place):
+        check_regular(file)
     return source.read
+
+
+def _files(place: str | os.PathLike[str]) -> Iterator[str]:
+    """Yield a file, or all files in a folder, each folder once even where links go in circles."""
+    yield os.fspath(place)
+    seen = set()
+    for folder, inner, names in os.walk(place, followlinks=True):
+        status = os.stat(folder)
+        if (key := (status.st_dev, status.st_ino)) in seen:
+            inner.clear()
+            continue
+        seen.add(key)
+        yield from (os.path.join(folder, name) for name in names)
 
 
 def write_episodes(
@@ -247,6 +264,7 @@ def format_to_read(path: str | os.PathLike[str], name: str | None = None) -> For
     """
     if name is not None:
         return FORMATS[name]
+    check_regular(path)
     path = Path(path)
     suffix, is_folder = path.suffix.lower(), path.is_dir()
     own = [entry for entry in _formats() if suffix in entry.suffixes]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from misstep.errors import MisstepError, reason_of
+from misstep.storage import check_regular
 
 _LONGEST_REASON = 300  # characters
 _LARGEST_JSON = 2**26  # bytes
@@ -75,6 +76,7 @@ def read_json(path: Path) -> dict[str, Any]:
     MisstepError
         If it is missing, too large, or no JSON object.
     """
+    check_regular(path)
     try:
         if path.stat().st_size > _LARGEST_JSON:
             raise MisstepError(f"{path.name} is too large to be one")

@@ -7,6 +7,7 @@ together, so that a hundred of them are two fits.
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from misstep.errors import MisstepError
 from misstep.live.worker import StoppedError, Worker
@@ -22,11 +23,14 @@ class Description:
         Of the recordings; nothing is described while there is no such file.
     changed : callable
         Called when there is another mixture.
+    **job
+        What else the worker's job ``describe`` takes.
     """
 
-    def __init__(self, worker: Worker, path: Path, changed: Callable[[], None]) -> None:
+    def __init__(self, worker: Worker, path: Path, changed: Callable[[], None], **job: Any) -> None:
         self._worker = worker
         self._path = path
+        self._job = {"attempts": str(path), **job}
         self._changed = changed
         self._stale = False
         self._cut_short = False
@@ -51,7 +55,7 @@ class Description:
             model = "null"
             if self._path.exists():
                 try:
-                    model = await self._worker.do("describe", attempts=str(self._path))
+                    model = await self._worker.do("describe", **self._job)
                 except StoppedError:
                     self._cut_short = True
                 except MisstepError:

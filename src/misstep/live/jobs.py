@@ -17,8 +17,9 @@ from misstep.learning import learn, resume
 from misstep.live.narration import tell_trial
 from misstep.live.packing import PACKED, unpacked
 from misstep.live.picture import show_mixture, show_recording, show_summary, still_columns, to_json
-from misstep.runs import Run, load_run
-from misstep.systems import System, make_system
+from misstep.runs import Run, load_config, load_run
+from misstep.systems import System, make_system, recorded_system
+from misstep.systems.recorded import system_kind
 from misstep.trajectory import Dataset, Trajectory
 
 MOST_STEPS = 300_000
@@ -30,18 +31,35 @@ Ask = Callable[[], str]
 """Wait until the server says how to go on: ``"next"`` or ``"halt"``."""
 
 
+_NOTHING: Mapping[str, Any] = {}
+
+
 class _HaltError(Exception):
     """A person has stopped the learning."""
 
 
-def describe(tell: Tell, ask: Ask, *, attempts: str) -> str:
-    """Return the mixture of what was recorded, as JSON; ``null`` where there is none."""
+def describe(
+    tell: Tell,
+    ask: Ask,
+    *,
+    attempts: str,
+    system: str = "",
+    parameters: Mapping[str, Any] = _NOTHING,
+) -> str:
+    """Return the mixture of what was recorded, as JSON; ``null`` where there is none.
+
+    Here and below, `system` and `parameters` are what the server was started with: what a
+    recording or a run says beyond that builds simulations alone.
+    """
     dataset = load_dataset(attempts)
-    system = _system_of(dataset)
-    chosen = [c.name for c in system.observation_columns if c.name not in still_columns(dataset)]
+    origin = dataset[0].provenance
+    typed = origin.system == system
+    given = _given(parameters, system) if typed else {}
+    driven = recorded_system(origin.system, origin.parameters, given, typed=typed)
+    chosen = [c.name for c in driven.observation_columns if c.name not in still_columns(dataset)]
     if not chosen:
         return to_json(None)
-    task = Task.of(system, chosen)
+    task = Task.of(driven, chosen)
     return to_json(show_mixture(task, tuple(dataset), None, np.random.default_rng(0)))
 
 
@@ -78,33 +96,48 @@ def learn_by_trial(
     return "succeeded" if run.succeeded else "finished"
 
 
-def resume_by_trial(tell: Tell, ask: Ask, *, folder: str) -> str:
+def resume_by_trial(
+    tell: Tell,
+    ask: Ask,
+    *,
+    folder: str,
+    system: str = "",
+    parameters: Mapping[str, Any] = _NOTHING,
+) -> str:
     """Go on with a run that was interrupted; what was tried is told first."""
-    run = open_run(tell, ask, folder=folder)
-    system = run.config.make_system()
+    run, driven = _opened(tell, folder, system, parameters)
     try:
-        resume(run, system=system, on_trial=_teller(system, tell, ask))
+        resume(run, system=driven, on_trial=_teller(driven, tell, ask))
     except _HaltError:
         return "halted"
     return "succeeded" if run.succeeded else "finished"
 
 
-def show_run(tell: Tell, ask: Ask, *, folder: str) -> str:
+def show_run(
+    tell: Tell,
+    ask: Ask,
+    *,
+    folder: str,
+    system: str = "",
+    parameters: Mapping[str, Any] = _NOTHING,
+) -> str:
     """Tell every trial of a run."""
-    run = open_run(tell, ask, folder=folder)
+    run, _ = _opened(tell, folder, system, parameters)
     if run.succeeded:
         return "succeeded"
     return "finished" if run.finished else "halted"
 
 
-def open_run(tell: Tell, ask: Ask, *, folder: str) -> Run:
-    """Load a run and tell its demonstrations and trials."""
-    run = load_run(folder)
-    system = run.config.make_system()
+def _opened(
+    tell: Tell, folder: str, name: str, parameters: Mapping[str, Any]
+) -> tuple[Run, System]:
+    """Load a run and its system, and tell its demonstrations and trials."""
+    system = load_config(Path(folder)).make_system(_given(parameters, name), typed=name)
+    run = load_run(folder, system=system)
     tell("demonstrations", to_json([show_recording(t) for t in run.demonstrations]))
     for number in range(1, len(run.trials) + 1):
         tell("trial", trial_picture(run, system, number))
-    return run
+    return run, system
 
 
 def read_upload(
@@ -182,9 +215,9 @@ def _teller(system: System, tell: Tell, ask: Ask) -> Callable[[Run], None]:
     return on_trial
 
 
-def _system_of(dataset: Dataset) -> System:
-    origin = dataset[0].provenance
-    return make_system(origin.system, **origin.parameters)
+def _given(parameters: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """Return the server's parameters where a file may not say its own."""
+    return {} if name and system_kind(name).typed_only == frozenset() else parameters
 
 
 JOBS: dict[str, Callable[..., Any]] = {

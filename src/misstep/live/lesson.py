@@ -7,15 +7,16 @@ where nobody wants to watch.
 
 import json
 import re
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from misstep.errors import MisstepError
 from misstep.learners import LEARNERS, LearnedPolicy
 from misstep.live.worker import StoppedError, Worker
-from misstep.runs import CONFIG, load_run
+from misstep.runs import CONFIG, load_config, load_run
 from misstep.storage import as_file_name, make_folder
+from misstep.systems import System
 
 _RUN_NAME = re.compile(r"([0-9]{3,})-[\w.-]+")
 
@@ -91,8 +92,19 @@ class Lesson:
         given = {"learner": learner, "state": list(state), "max_trials": max_trials, "out": out}
         return self._watch_over("learn", {**given, **job})
 
-    def load(self, name: str, system: str, *, go_on: bool) -> Awaitable[str]:
+    def load(
+        self, name: str, system: str, parameters: Mapping[str, Any], *, go_on: bool
+    ) -> Awaitable[str]:
         """Put a run on the desk, and go on with it if wanted; return what waits for its end.
+
+        Parameters
+        ----------
+        name : str
+        system : str
+            Which it has to drive.
+        parameters : mapping
+            Of that system, as the server was started with.
+        go_on : bool
 
         Raises
         ------
@@ -100,11 +112,12 @@ class Lesson:
             If there is no such run, or it drives another system.
         """
         folder = self.run_folder(name)
-        config = load_run(folder).config
+        config = load_config(folder)
         if config.system != system:
             raise MisstepError(f"that run drives {config.system}: choose that system first")
         self._put_on_desk(name, config.learner, config.state, config.max_trials, 0)
-        return self._watch_over("resume" if go_on else "show_run", {"folder": str(folder)})
+        job = {"folder": str(folder), "system": system, "parameters": parameters}
+        return self._watch_over("resume" if go_on else "show_run", job)
 
     def close(self) -> None:
         """Take the run off the desk."""
@@ -129,8 +142,8 @@ class Lesson:
         else:
             self._worker.stop()
 
-    def policy(self) -> LearnedPolicy:
-        """Return the policy of the first success, or else of the last trial.
+    def policy(self, system: System) -> LearnedPolicy:
+        """Return the policy of the first success, or else of the last trial, for `system`.
 
         Raises
         ------
@@ -140,7 +153,7 @@ class Lesson:
         if self.run is None or not self.trials:
             raise MisstepError("nothing has been learned yet")
         if self._policy is None:
-            run = load_run(self._folder / self.run["name"])
+            run = load_run(self._folder / self.run["name"], system=system)
             self._policy = run.policies[(run.trials_to_success or len(run.trials)) - 1]
         return self._policy
 

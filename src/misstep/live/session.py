@@ -110,7 +110,8 @@ class Session:
         driving, attempts = Driving(system, self._rng), Attempts(folder)
         self.lesson = Lesson(self.worker, folder / "runs", key, self.changed)
         self.driving, self.attempts = driving, attempts
-        self.description = Description(self.worker, self.attempts.path, self._tell_model)
+        given = {"system": name, "parameters": self._given.get(name, {})}
+        self.description = Description(self.worker, self.attempts.path, self._tell_model, **given)
         self._listing = Listing()
         self.system, self.name = system, name
         self.shown_system = show_system(name, system)
@@ -452,11 +453,13 @@ class Session:
 
     def _do_resume_run(self, name: str) -> None:
         self._need("ready")
-        self._start_learning(self.lesson.load(name, self.name, go_on=True))
+        given = self._given.get(self.name, {})
+        self._start_learning(self.lesson.load(name, self.name, given, go_on=True))
 
     def _do_open_run(self, name: str) -> None:
         self._need("ready")
-        self._start_learning(self.lesson.load(name, self.name, go_on=False))
+        given = self._given.get(self.name, {})
+        self._start_learning(self.lesson.load(name, self.name, given, go_on=False))
 
     def _start_learning(self, end: Awaitable[str]) -> None:
         self.note = ""
@@ -493,7 +496,7 @@ class Session:
     def _do_balance(self) -> None:
         self._need("ready")
         given = self._given.get(self.name, {})
-        balancing = Balancing(self.name, given, self.lesson.policy(), self._rng)
+        balancing = Balancing(self.name, given, self.lesson.policy(self.system), self._rng)
         self.note = ""
         self._set_mode("balancing")
         self.balancing = balancing

@@ -9,8 +9,10 @@ would inherit that of whichever caller is compiled first.
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
 import math
 
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
+
+from misstep.compiling import njit
 
 # Fast-math of the two functions here, and of the loops that call them.
 CONTRACT = {"contract"}

@@ -21,9 +21,9 @@ broadcasting would take most of the time that compiling takes.
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from misstep.compiling import njit
 from misstep.mixture.compiled import COMPILED, precompute
 from misstep.mixture.elementary import REORDER, exp_nonpositive, log_positive
 

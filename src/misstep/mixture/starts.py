@@ -8,9 +8,9 @@ needs.
 
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from misstep.compiling import njit
 from misstep.mixture.compiled import COMPILED
 from misstep.mixture.em import BLOCK, Mixture, Samples
 

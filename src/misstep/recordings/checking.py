@@ -18,7 +18,7 @@ from misstep.errors import MisstepError
 from misstep.formats.format import Block, Episode, Header
 from misstep.recordings.equations import EquationCheck, check_equations, explained
 from misstep.recordings.motion import FEWEST_ROWS
-from misstep.systems import JUDGE_PARAMETERS, SYSTEMS, System, make_system
+from misstep.systems import JUDGE_PARAMETERS, SYSTEMS, System, recorded_system
 from misstep.trajectory import Outcome, Trajectory
 
 MOST_EPISODES = 100
@@ -83,7 +83,7 @@ class Checked:
 def check_recorded(trajectories: Sequence[Trajectory]) -> Checked:
     """Hold trajectories against the systems that their provenance names.
 
-    Only systems of the registry are built, since a file may name anything.
+    Only simulations are built, since a file may name anything (`recorded_system`).
 
     Parameters
     ----------
@@ -100,12 +100,12 @@ def check_recorded(trajectories: Sequence[Trajectory]) -> Checked:
     numbered = list(enumerate(trajectories[:MOST_EPISODES]))
     for (name, _, _), group in groupby(numbered, key=stated):
         members = list(group)
-        if name not in SYSTEMS:
+        if name not in SYSTEMS or SYSTEMS[name].mechanics is System.mechanics:
             continue
         judges = {row.name for row in JUDGE_PARAMETERS}
         said = members[0][1].provenance.parameters
         try:
-            system = make_system(name, **{k: v for k, v in said.items() if k not in judges})
+            system = recorded_system(name, {k: v for k, v in said.items() if k not in judges})
         except MisstepError as error:
             reasons.append(str(error))
             continue
@@ -228,9 +228,12 @@ def _check(numbered: Sequence[tuple[int, Trajectory]], system: System) -> Checke
     if not long:
         return Checked(reason=f"every episode is shorter than {FEWEST_ROWS} rows")
     try:
-        checks = check_equations([trajectory for _, trajectory in long], system)
+        with np.errstate(all="ignore"):  # a file may state masses of 10³⁰⁸ kg: nothing fits them
+            checks = check_equations([trajectory for _, trajectory in long], system)
     except MisstepError as error:
         return Checked(reason=str(error))
+    if not all(math.isfinite(c.residual) and math.isfinite(c.r_squared or 0.0) for c in checks):
+        return Checked(reason=f"{system.system_id} is beyond reckoning with its stated parameters")
     return Checked(tuple(replace(check, episode=long[check.episode][0]) for check in checks))
 
 

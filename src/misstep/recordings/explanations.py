@@ -4,6 +4,7 @@ Each is tried on rows of all episodes together, and kept if it leaves much less 
 the joints without a motor accelerate.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -124,7 +125,8 @@ def better_fits(
 def _unexplained(rows: Rows, mechanics: Mechanics, reading: Reading) -> float:
     """Return the largest share of a free joint's acceleration that is left unexplained."""
     shares = compare(rows, mechanics, reading)[1]
-    return max((1.0 - share for share in shares if share is not None), default=0.0)
+    most = max((1.0 - share for share in shares if share is not None), default=0.0)
+    return most if math.isfinite(most) else math.inf  # of a mass of 10³⁰⁸ kg
 
 
 def _parameter_fits(
@@ -197,7 +199,7 @@ def _minimum(left: Callable[[float], float], typical: float, stated: float) -> t
     grid = np.linspace(-end, end, PARAMETER_GRID)
     values = np.array([left(point) for point in grid])
     around = np.concatenate([[np.inf], values, [np.inf]])
-    minima = []
+    minima = [(np.inf, stated or typical)]
     dips = np.flatnonzero((values < around[:-2]) & (values <= around[2:]))
     for i in dips[np.argsort(values[dips])][:MOST_MINIMA]:
         bounds = (grid[max(i - 1, 0)], grid[min(i + 1, len(grid) - 1)])

@@ -16,10 +16,10 @@ always within all three limits at once.
 import math
 
 import numpy as np
-from numba import njit
 from numba.types import float64, int64
 from numpy.typing import ArrayLike, NDArray
 
+from misstep.compiling import njit
 from misstep.robot.limits import Limits, Reason, Row
 
 Table = NDArray[np.float64]

@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 from misstep.errors import MisstepError
 from misstep.robot.guard import Command
 from misstep.robot.limits import Reason, Row
+from misstep.storage import check_regular
 
 _MAGIC = b"MISSTEP1"
 _HEAD = struct.Struct("<BBH")
@@ -216,6 +217,7 @@ def read_log(path: str | os.PathLike[str]) -> tuple[dict[str, Any], Iterator[Sen
         If the file cannot be read or is no log.
     """
     try:
+        check_regular(path)
         with Path(path).open("rb") as file:
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as error:

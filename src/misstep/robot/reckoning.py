@@ -20,10 +20,10 @@ in plain Python.
 import math
 
 import numpy as np
-from numba import njit
 from numba.types import boolean, float64, int64, void
 from numpy.typing import NDArray
 
+from misstep.compiling import njit
 from misstep.robot.limiter import ROWS, WANTED, move, table_of
 from misstep.robot.limits import Limits
 

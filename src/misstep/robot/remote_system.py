@@ -78,6 +78,8 @@ class RemoteSystem(System):
 
     system_id = "remote"
     parameters_type = RemoteParameters
+    # The token goes there.
+    typed_only = frozenset({"address"})
 
     def __init__(self, render_mode: str | None = None, **parameters: ParameterValue) -> None:
         if render_mode is not None:
@@ -144,7 +146,10 @@ class RemoteSystem(System):
     def _connect(self) -> tuple[Link, dict[str, Any]]:
         """Return a connection, and the parameters that the robot describes itself with."""
         if not self._address:
-            raise MisstepError("remote: it has no address, so it can only be served, not driven")
+            raise MisstepError(
+                "remote: it has no address, so it can only be served, not driven: give it, since "
+                "none is taken from a file"
+            )
         link = open_link(self._address, _TIMEOUT)
         hello = {"token": os.environ.get(TOKEN, ""), "role": "drive", "version": VERSION}
         try:

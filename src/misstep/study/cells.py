@@ -20,8 +20,7 @@ from misstep.errors import MisstepError
 from misstep.learning import evaluate, learn
 from misstep.runs import Run
 from misstep.storage import read_json
-from misstep.study.spec import Cell
-from misstep.systems import make_system
+from misstep.study.spec import Cell, simulation
 from misstep.systems.rendering import write_video
 
 Status = Literal["done", "error", "lost"]
@@ -161,7 +160,7 @@ def _learn(cell: Cell, on_trial: Callable[[Run], None]) -> Run:
     case = cell.case
     demonstrator: Mapping[str, Any] = cell.demonstrator.parameters
     learner: Mapping[str, Any] = cell.learner.parameters
-    system = make_system(case.system, **case.parameters)
+    system = simulation(case.system, case.parameters)
     shown = demonstrate(
         system,
         cell.demonstrator.name,
@@ -183,7 +182,7 @@ def _learn(cell: Cell, on_trial: Callable[[Run], None]) -> Run:
 
 def _test(cell: Cell, run: Run) -> int:
     case = cell.case
-    system = make_system(case.system, **{**case.parameters, **case.test_parameters})
+    system = simulation(case.system, {**case.parameters, **case.test_parameters})
     return evaluate(system, run.policy, episodes=cell.tests, seed=_seed(cell, 2)).successes
 
 

@@ -40,7 +40,9 @@ from misstep.demonstrators import DEMONSTRATORS
 from misstep.errors import MisstepError
 from misstep.learners import LEARNERS, Task
 from misstep.parameters import ParameterValue, build_parameters
-from misstep.systems import make_system
+from misstep.systems import System
+from misstep.systems.gymnasium_adapter import PREFIX
+from misstep.systems.recorded import recorded_system, system_kind
 
 QUICK, MOST_QUICK_TESTS = 50, 2
 """A quick study makes one repetition in so many, but at least one, and no more tests than this."""
@@ -282,12 +284,22 @@ def _read_case(entry: dict[str, Any]) -> list[Case]:
     return [_built(case, variant) for variant in variants]
 
 
+def simulation(name: str, parameters: Mapping[str, ParameterValue]) -> System:
+    """Build a system; raise MisstepError for one that a study, a file, must not name."""
+    is_gym = name.startswith(PREFIX)
+    if not is_gym and system_kind(name).typed_only != frozenset():
+        raise MisstepError(
+            f"a study makes its trials in simulations, and {name} may open files or connections"
+        )
+    return recorded_system(name, parameters, typed=is_gym)
+
+
 def _built(case: Case, variant: dict[str, ParameterValue]) -> Case:
     """Return a variant of the case after building everything that it names."""
     parameters = {**case.parameters, **variant}
-    system = make_system(case.system, **parameters)
+    system = simulation(case.system, parameters)
     with _inside("test_set"):
-        make_system(case.system, **{**parameters, **case.test_parameters})
+        simulation(case.system, {**parameters, **case.test_parameters})
     for choice in case.demonstrators:
         kind = DEMONSTRATORS[choice.name]
         build_parameters(kind, f"demonstrator {choice.name}", choice.parameters)

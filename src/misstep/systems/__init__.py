@@ -24,6 +24,7 @@ from misstep.systems.gymnasium_adapter import (
     make_gym_system,
 )
 from misstep.systems.judged import JUDGE_PARAMETERS, Judged
+from misstep.systems.recorded import recorded_system
 from misstep.systems.striking import StrikingSystem
 from misstep.systems.system import System
 
@@ -45,6 +46,7 @@ __all__ = [
     "System",
     "list_systems",
     "make_system",
+    "recorded_system",
 ]
 
 SYSTEMS: Registry[type[System]] = Registry("system", "misstep.systems")

@@ -156,6 +156,7 @@ class Basket(StrikingSystem):
     """
 
     system_id: ClassVar[str] = "basket"
+    typed_only: ClassVar[frozenset[str] | None] = frozenset()
     parameters_type: ClassVar[type] = BasketParameters
     observation_columns = (
         Column("position", "m"),

@@ -235,6 +235,7 @@ class CartPole(Simulated):
     """
 
     system_id: ClassVar[str] = "cartpole"
+    typed_only: ClassVar[frozenset[str] | None] = frozenset()
     parameters_type: ClassVar[type[CartPoleParameters]] = CartPoleParameters
     observation_columns = (
         Column("x", "m"),

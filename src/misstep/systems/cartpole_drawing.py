@@ -90,6 +90,8 @@ class _CartPoleView:
     def marks(self, x: float) -> Iterator[tuple[float, bool]]:
         """Yield the place [m] of each mark in view from `x`, and whether it is a long one."""
         reach = 1.1 * self._half_view
+        if not reach * MARKS_PER_METRE < MARKS_PER_LONG_MARK * _MOST_MARKS:
+            return  # even the long ones would be too dense
         first = math.ceil((x - reach) * MARKS_PER_METRE)
         last = math.floor((x + reach) * MARKS_PER_METRE)
         short_ones = last - first < _MOST_MARKS

@@ -40,6 +40,7 @@ class CartPoleRail(CartPole):
     """
 
     system_id: ClassVar[str] = "cartpole-rail"
+    typed_only: ClassVar[frozenset[str] | None] = frozenset()
     parameters_type: ClassVar[type[CartPoleParameters]] = CartPoleRailParameters
 
 
@@ -84,4 +85,5 @@ class CartPoleSwingUp(CartPole):
     """
 
     system_id: ClassVar[str] = "cartpole-swingup"
+    typed_only: ClassVar[frozenset[str] | None] = frozenset()
     parameters_type: ClassVar[type[CartPoleParameters]] = CartPoleSwingUpParameters

@@ -152,6 +152,7 @@ class FlipUp(StrikingSystem):
     """
 
     system_id: ClassVar[str] = "flipup"
+    typed_only: ClassVar[frozenset[str] | None] = frozenset()
     parameters_type: ClassVar[type] = FlipUpParameters
     observation_columns = (
         Column("position", "m"),

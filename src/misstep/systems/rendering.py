@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from misstep.errors import MisstepError
+from misstep.errors import MisstepError, reason_of
 from misstep.parameters import ParameterValue, parameter_table
 from misstep.storage import atomic_write
 from misstep.systems import JUDGE_PARAMETERS, SYSTEMS
@@ -360,10 +360,17 @@ def _drawing(
     with_opengl, without = _drawings_of(system)
     shown = _shown_parameters(system, parameters)
     try:
-        return with_opengl(shown, width, height)
-    except NoOpenGLError as error:
-        _tell_flat(str(error))
-        return without(shown, width, height)
+        try:
+            return with_opengl(shown, width, height)
+        except NoOpenGLError as error:
+            _tell_flat(str(error))
+            return without(shown, width, height)
+    except MisstepError:
+        raise
+    except (ArithmeticError, ValueError) as error:  # a file may state a radius of 10⁻⁹ m
+        raise MisstepError(
+            f"{system} cannot be drawn with its parameters: {reason_of(error)}"
+        ) from error
 
 
 def _shown_parameters(

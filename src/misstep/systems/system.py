@@ -6,7 +6,7 @@ parameters the same system can be built again.
 """
 
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -37,6 +37,10 @@ class System(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         Name in the registry of systems.
     parameters_type : type
         Dataclass of the constructor's parameters, see `misstep.parameters`.
+    typed_only : frozenset of str or None
+        Parameters that only the user may give, and never a file: those by which it reaches files,
+        networks or machines. None, unless the class itself states something else: a file must not
+        even name the system. See `recorded_system`.
     dt : float, s
         Control period.
     observation_columns : tuple of Column, length n
@@ -49,11 +53,17 @@ class System(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
 
     system_id: ClassVar[str]
     parameters_type: ClassVar[type]
+    typed_only: ClassVar[frozenset[str] | None] = None
     dt: float
     observation_columns: tuple[Column, ...]
     action_columns: tuple[Column, ...]
     parameters: dict[str, ParameterValue]
     cost: StateCost | None = None
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        # Not inherited: what is derived from a simulation may well drive a machine.
+        cls.typed_only = cls.__dict__.get("typed_only")
 
     @property
     def unwrapped(self) -> "System":

@@ -30,6 +30,8 @@ _LARGEST_RATIO = 100  # of the size of a file to its packed size; recordings rea
 _SMALL = 2**24  # bytes: whatever the ratio, no harm
 
 _SQLITE = b"SQLite format 3\x00"
+# What files begin with, by suffix: rosbags would look for an index in gigabytes of anything else.
+_MAGIC = {".bag": b"#ROSBAG V2.0\n", ".mcap": b"\x89MCAP0\r\n", ".db3": _SQLITE}
 # A frame, or one to be skipped.
 _ZSTD = re.compile(rb"\x28\xb5\x2f\xfd|[\x50-\x5f]\x2a\x4d\x18", re.DOTALL)
 
@@ -130,6 +132,9 @@ def _check_file(file: Path) -> None:
     """Refuse a file that would fill the disk or never end."""
     with open(file, "rb") as start:
         beginning = start.read(len(_SQLITE))
+    magic = _MAGIC.get(file.suffix.lower(), b"")
+    if not beginning.startswith(magic):
+        raise MisstepError(f"{file.name} does not begin as a {file.suffix} file does")
     if beginning == _SQLITE:
         check_base(file)
     elif _ZSTD.match(beginning):
