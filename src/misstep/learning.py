@@ -19,6 +19,7 @@ from misstep.learners import Evidence, LearnedPolicy, Task, default_learner
 from misstep.parameters import ParameterValue
 from misstep.rollout import Policy, rollout
 from misstep.runs import Run, RunConfig
+from misstep.seeds import Stream, stream_of
 from misstep.systems import System
 from misstep.trajectory import Dataset, Outcome, column_listing
 
@@ -256,7 +257,7 @@ def evaluate(system: System, policy: Policy, *, episodes: int = 100, seed: int =
     if seed < 0:
         raise MisstepError(f"seed is {seed}: it must not be negative")
     successes, costs = 0, []
-    for stream in np.random.SeedSequence(seed, spawn_key=(1,)).spawn(episodes):
+    for stream in stream_of(seed, Stream.TEST).spawn(episodes):
         start = int(stream.generate_state(1)[0])
         trial = rollout(system, policy, seed=start, demonstrator="evaluation")
         successes += trial.outcome is Outcome.SUCCESS

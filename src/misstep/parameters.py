@@ -5,10 +5,13 @@ command line and the Python interface of a system, a demonstrator or a learner. 
 hold is written once, beside it, and checked whenever an instance is made.
 """
 
+import numbers
 import sys
 from collections.abc import Mapping
-from dataclasses import Field, field, fields
-from typing import Any, NamedTuple, TypeVar, cast
+from dataclasses import Field, field, fields, is_dataclass
+from typing import Any, NamedTuple, TypeVar, cast, get_type_hints
+
+import numpy as np
 
 from misstep.errors import MisstepError
 
@@ -80,7 +83,24 @@ def other_default(kind: type, name: str, default: ParameterValue) -> Any:
 
 
 def parameter_table(kind: type) -> list[ParameterRow]:
-    """Return the parameters of the dataclass `kind` in the order of their declaration."""
+    """Return the parameters of the dataclass `kind` in the order of their declaration.
+
+    Raises
+    ------
+    MisstepError
+        If it is no dataclass, or a field was not declared by `parameter`.
+    """
+    if not is_dataclass(kind):
+        raise MisstepError(
+            f"{kind.__name__} is no dataclass: parameters are the fields of a frozen dataclass, each "
+            "declared by misstep.parameters.parameter"
+        )
+    for f in fields(kind):
+        if "meaning" not in f.metadata:
+            raise MisstepError(
+                f"{kind.__name__}.{f.name} says no unit and meaning: declare it as {f.name} = "
+                "parameter(default, unit, meaning)"
+            )
     return [
         ParameterRow(
             f.name, cast(ParameterValue, f.default), f.metadata["unit"], f.metadata["meaning"]
@@ -116,22 +136,30 @@ def check_parameters(parameters: Any, owner: str) -> None:
     MisstepError
         If a value is of the wrong type, not finite, or out of its range.
     """
+    parameter_table(type(parameters))
+    # Where a module says `from __future__ import annotations`, a field's own type is a text.
+    kinds = get_type_hints(type(parameters))
     for f in fields(parameters):
-        value = _of_type(f, getattr(parameters, f.name), owner)
+        value = _of_type(f, kinds[f.name], getattr(parameters, f.name), owner)
         _check_range(f, value, owner)
         object.__setattr__(parameters, f.name, value)
 
 
-def _of_type(f: Field[Any], value: object, owner: str) -> ParameterValue:
-    wanted: Any = f.type
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    finite = number and -LARGEST <= value <= LARGEST  # type: ignore[operator]
+def _of_type(f: Field[Any], wanted: Any, value: Any, owner: str) -> ParameterValue:
+    if wanted not in _KIND_OF:
+        raise MisstepError(
+            f"{owner}: {f.name} is declared as {wanted}: a parameter is a float, int, bool or str"
+        )
+    if isinstance(value, np.bool_):
+        value = bool(value)
+    number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    finite = number and -LARGEST <= value <= LARGEST
     if wanted is float and finite:
-        return float(value)  # type: ignore[arg-type]
-    if wanted is int and finite and value == int(value):  # type: ignore[call-overload]
-        return int(value)  # type: ignore[call-overload]
+        return float(value)
+    if wanted is int and finite and value == int(value):
+        return int(value)
     if wanted in (bool, str) and isinstance(value, wanted):
-        return value
+        return wanted(value)
     unit = f" in {f.metadata['unit']}" if f.metadata["unit"] else ""
     kind = _KIND_OF[wanted]
     if number and not finite:

@@ -17,7 +17,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -181,7 +181,14 @@ class Run:
         return enough or (self.config.stop_on_success and self.succeeded)
 
     def add(self, policy: LearnedPolicy, trial: Trajectory, seconds: float) -> None:
-        """Append a finished trial, on disk first if the run has a folder."""
+        """Append a finished trial, on disk first if the run has a folder.
+
+        Where another version of misstep began the run, the trial says so.
+        """
+        if self.config.version != __version__:
+            note = f"made by misstep {__version__}, of a run that {self.config.version} began"
+            source = trial.provenance
+            trial = replace(trial, provenance=replace(source, notes=(*source.notes, note)))
         if self.folder is not None:
             name = f"trial_{len(self.trials):03d}"
             arrays = {**policy.arrays(), "computing_seconds": np.array(seconds)}

@@ -11,7 +11,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from datetime import datetime
 from enum import StrEnum
-from types import MappingProxyType
 from typing import Any, overload
 
 import numpy as np
@@ -60,6 +59,21 @@ class Outcome(StrEnum):
     UNKNOWN = "unknown"
 
 
+class _ReadOnly(dict[str, float | int | bool | str]):
+    """A dictionary that nobody can change, and so one that can be a key."""
+
+    def _refuse(self, *arguments: Any, **named: Any) -> Any:
+        raise TypeError("the parameters of a provenance cannot be changed")
+
+    __setitem__ = __delitem__ = update = setdefault = pop = popitem = clear = __ior__ = _refuse
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(frozenset(self.items()))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _ReadOnly, (dict(self),)  # a pickle would fill it entry by entry
+
+
 @dataclass(frozen=True)
 class Provenance:
     """Where a trajectory comes from.
@@ -103,23 +117,12 @@ class Provenance:
         if not isinstance(self.parameters, Mapping):
             raise MisstepError(f"parameters is {self.parameters!r}: it maps names to values")
         parameters = {_parameter_name(k): _parameter(k, v) for k, v in self.parameters.items()}
-        object.__setattr__(self, "parameters", MappingProxyType(parameters))
+        object.__setattr__(self, "parameters", _ReadOnly(parameters))
         if self.seed is not None:
             seed = _integer(self.seed, "seed")
             if not 0 <= seed < _SEED_BOUND:
                 raise MisstepError(f"seed is {seed}: it lies in 0 .. 2**128 - 1, or is None")
             object.__setattr__(self, "seed", seed)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        # A read-only view of a mapping cannot be pickled, a plain dict can.
-        return Provenance, (
-            self.system,
-            dict(self.parameters),
-            self.demonstrator,
-            self.seed,
-            self.time,
-            self.notes,
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,6 +223,9 @@ class Trajectory:
     def cut(self, step: int) -> "Trajectory":
         """Return the first `step` actions and the observations around them.
 
+        A failure that has happened by then remains one. What else came of the attempt came after,
+        so of the part the outcome is unknown.
+
         Raises
         ------
         MisstepError
@@ -227,9 +233,12 @@ class Trajectory:
         """
         if not 1 <= step <= self.n_steps:
             raise MisstepError(f"cannot cut at step {step}: there are {self.n_steps} actions")
+        if step == self.n_steps:
+            return self
         failed = self.failure_step is not None and self.failure_step <= step
         return replace(
             self,
+            outcome=self.outcome if failed else Outcome.UNKNOWN,
             observations=self.observations[: step + 1],
             actions=self.actions[:step],
             costs=None if self.costs is None else self.costs[:step],

@@ -22,44 +22,58 @@ def list_(
     if what not in _CATALOGUES:
         raise MisstepError(f"nothing to list named {what!r}; there are: {', '.join(_CATALOGUES)}")
     check_output_file(json, "--json")
-    entries = _CATALOGUES[what]()
-    write_result(json, {"parameters": {"what": what}, what: entries})
+    entries, broken = _CATALOGUES[what]()
+    write_result(json, {"parameters": {"what": what}, what: entries, "broken": broken})
+    _print(what, entries)
+    for reason in broken.values():
+        print(reason)
+    return 0
+
+
+def _print(what: str, entries: dict[str, dict[str, Any]]) -> None:
     if what == "formats":
         _print_formats(entries)
-        return 0
+        return
     for name, entry in entries.items():
         print(f"{name}: {entry['summary']}")
         if entry.get("parameters"):
             rows = [ParameterRow(**row) for row in entry["parameters"]]
             cells = [(r.name, _default(r), r.unit, r.meaning) for r in rows]
             print_table(("parameter", ">default", "unit", "meaning"), cells)
-    return 0
 
 
-def _systems() -> dict[str, dict[str, Any]]:
+_Catalogue = tuple[dict[str, dict[str, Any]], dict[str, str]]
+"""What there is, and why some of it cannot be used."""
+
+
+def _systems() -> _Catalogue:
     from misstep.systems import JUDGE_PARAMETERS, SYSTEMS, GymParameters, GymSystem
 
-    kinds = {name: _describe(kind, kind.parameters_type) for name, kind in SYSTEMS.items()}
+    loaded, broken = SYSTEMS.loaded()
+    kinds = {name: _describe(kind, kind.parameters_type) for name, kind in loaded.items()}
     adapter = _describe(GymSystem, GymParameters)
     adapter["parameters"] += [row._asdict() for row in JUDGE_PARAMETERS]
-    return {**kinds, "gym:ID": adapter}
+    return {**kinds, "gym:ID": adapter}, broken
 
 
-def _learners() -> dict[str, dict[str, Any]]:
+def _learners() -> _Catalogue:
     from misstep import LEARNERS
 
-    return {name: {"rung": kind.rung, **_describe(kind, kind)} for name, kind in LEARNERS.items()}
+    loaded, broken = LEARNERS.loaded()
+    return {n: {"rung": kind.rung, **_describe(kind, kind)} for n, kind in loaded.items()}, broken
 
 
-def _demonstrators() -> dict[str, dict[str, Any]]:
+def _demonstrators() -> _Catalogue:
     from misstep import DEMONSTRATORS
 
-    return {name: _describe(kind, kind) for name, kind in DEMONSTRATORS.items()}
+    loaded, broken = DEMONSTRATORS.loaded()
+    return {name: _describe(kind, kind) for name, kind in loaded.items()}, broken
 
 
-def _formats() -> dict[str, dict[str, Any]]:
+def _formats() -> _Catalogue:
     from misstep import FORMATS
 
+    loaded, broken = FORMATS.loaded()
     return {
         name: {
             "summary": entry.description,
@@ -70,11 +84,11 @@ def _formats() -> dict[str, dict[str, Any]]:
             "writes": entry.write is not None,
             "extra": entry.extra,
         }
-        for name, entry in FORMATS.items()
-    }
+        for name, entry in loaded.items()
+    }, broken
 
 
-_CATALOGUES: dict[str, Callable[[], dict[str, dict[str, Any]]]] = {
+_CATALOGUES: dict[str, Callable[[], _Catalogue]] = {
     "systems": _systems,
     "learners": _learners,
     "demonstrators": _demonstrators,

@@ -93,7 +93,8 @@ def demonstrate(
         raise MisstepError(f"n is {n}: at least 1 demonstration must be asked for")
     driven = system.unwrapped  # whoever judges, it is the same to drive
     if not kind.fits(driven):
-        fitting = [name for name in DEMONSTRATORS if DEMONSTRATORS[name].fits(driven)]
+        kinds = DEMONSTRATORS.loaded()[0]
+        fitting = [name for name, other in kinds.items() if other.fits(driven)]
         raise MisstepError(
             f"demonstrator {by} does not fit {system.system_id}: {kind.needs}; "
             f"these kinds fit: {', '.join(fitting) or 'none'}"
@@ -115,7 +116,8 @@ def demonstrate(
 
 def list_demonstrators() -> dict[str, list[ParameterRow]]:
     """Return the table of parameters (name, default, unit, meaning) of every demonstrator."""
-    return {name: parameter_table(DEMONSTRATORS[name]) for name in DEMONSTRATORS}
+    kinds = DEMONSTRATORS.loaded()[0]
+    return {name: parameter_table(kind) for name, kind in kinds.items()}
 
 
 def _attempt_seed(seed: int, attempt: int) -> int:

@@ -7,7 +7,6 @@ memory; `read_episodes` and `write_episodes` pass recordings of any size block b
 
 import os
 from collections.abc import Iterable, Iterator
-from functools import cache
 from itertools import chain
 from pathlib import Path
 
@@ -277,17 +276,20 @@ def format_to_read(path: str | os.PathLike[str], name: str | None = None) -> For
         if path.exists() and candidate.recognise(path):
             return candidate
     if is_folder and suffix not in {s for f in _formats() for s in f.suffixes}:
-        folders = ", ".join(name for name, entry in FORMATS.items() if entry.is_folder) or "none"
+        folders = (
+            ", ".join(name for name, entry in FORMATS.loaded()[0].items() if entry.is_folder)
+            or "none"
+        )
         raise MisstepError(
             f"{path}: the folder is of no known format; formats that are folders: {folders}"
         )
     return format_of(path)
 
 
-@cache  # looking through the installed packages takes longer than writing a trajectory
 def _formats() -> tuple[Format, ...]:
-    return tuple(FORMATS.values())
+    """Return the formats that can be loaded: one that cannot is no reason to read no file."""
+    return tuple(FORMATS.loaded()[0].values())
 
 
 def _name_of(target: Format) -> str:
-    return next(name for name, entry in FORMATS.items() if entry is target)
+    return next(name for name, entry in FORMATS.loaded()[0].items() if entry is target)

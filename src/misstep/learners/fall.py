@@ -112,15 +112,19 @@ class Fall(LinearLearner):
 
     def policy(self, task: Task, evidence: Evidence, rng: np.random.Generator) -> LinearPolicy:
         """Return the cautious linear policy against the dangers."""
-        failed = [t.failure_step is not None for t in evidence.attempts]
-        if not any(failed):
+        # How an attempt was lost that began as a failure, nobody has seen.
+        demonstrations = [t for t in evidence.demonstrations if t.failure_step != 0]
+        tried = [*demonstrations, *(t for t in evidence.trials if t.failure_step != 0)]
+        failed = [t.failure_step is not None for t in tried]
+        if not any(failed) or not demonstrations:
             raise MisstepError(
-                "fall needs the time of at least one failure: set a failure predicate (rung 2)"
+                "fall needs the time of at least one failure, after the start of its attempt: give "
+                "the system a failure predicate, or mark when the recordings failed"
             )
-        cut = [_until_failure(t) for t in evidence.attempts]
+        cut = [_until_failure(t) for t in tried]
         origin = np.mean([t.select(task.state)[0] for t in cut], axis=0)
         spread = joint_samples(task, cut)[:, : len(task.state)].std(axis=0)
-        weights = shares_of_the_usual(cut, len(evidence.demonstrations))
+        weights = shares_of_the_usual(cut, len(demonstrations))
         steady = len(evidence.trials) < self.steady_trials
         if not steady:
             weights *= rng.exponential(size=len(cut))
@@ -132,7 +136,7 @@ class Fall(LinearLearner):
             Scaled((t.select(task.state) - origin) / spread, (t.actions - centre) / half, f, w)
             for t, f, w in zip(cut, failed, weights, strict=True)
         ]
-        ways = ways_to_fail(attempts, len(evidence.demonstrations))[:MOST_WAYS]
+        ways = ways_to_fail(attempts, len(demonstrations))[:MOST_WAYS]
         dangers = sorted((learn_danger(way, task.dt) for way in ways), key=lambda d: d.time_scale)
         rows = cascade(attempts, dangers, self.horizon, task.dt)
         gain = rows[:, 1:] / spread
@@ -270,7 +274,7 @@ def _half_way(a: LinearPolicy, b: LinearPolicy) -> LinearPolicy:
 def _until_failure(trajectory: Trajectory) -> Trajectory:
     """Return the trajectory up to its failure: what follows is no attempt any more."""
     step = trajectory.failure_step
-    if step is None or step in (0, trajectory.n_steps):
+    if step is None or step == trajectory.n_steps:
         return trajectory
     return trajectory.cut(step)
 

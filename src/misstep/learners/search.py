@@ -39,10 +39,16 @@ class CmaEs(LinearLearner):
         import cma  # slow to import, and no other learner needs it
 
         space = LinearSpace(task, evidence.demonstrations)
-        # The library takes 0 to mean "by the clock".
-        options = {"seed": evidence.seed % (2**31 - 2) + 1, "verbose": -9}
+        past = np.random.default_rng(evidence.seed)
+
+        def normal(*shape: int) -> Array:
+            return past.standard_normal(shape)
+
+        # Not a number: leave NumPy's global generator alone.
+        options = {"seed": np.nan, "randn": normal, "verbose": -9}
         search = cma.CMAEvolutionStrategy(space.average(), self.size, options)
-        losses = [total_cost(trial) for trial in evidence.trials]
+        worst = worst_cost(evidence.demonstrations)
+        losses = [excess_cost(trial, worst) for trial in evidence.trials]
         candidates = search.ask()
         while len(losses) >= len(candidates):
             search.tell(candidates, losses[: len(candidates)])
@@ -77,7 +83,7 @@ class Power(LinearLearner):
     def policy(self, task: Task, evidence: Evidence, rng: np.random.Generator) -> LinearPolicy:
         """Return the reward-weighted mean of the best, perturbed."""
         space = LinearSpace(task, evidence.demonstrations)
-        rewards = _rewards(evidence.attempts)
+        rewards = _rewards(evidence.attempts, worst_cost(evidence.demonstrations))
         lengths = [t.n_steps for t in evidence.demonstrations]
         start = space.average(np.repeat(rewards[: len(lengths)], lengths))
         if not evidence.trials:
@@ -89,23 +95,40 @@ class Power(LinearLearner):
         return space.policy(space.perturbed(mean, self.size, rng))
 
 
-def total_cost(attempt: Trajectory) -> float:
-    """Return by how much an attempt's steps cost less than its worst one, summed, with a minus.
-
-    Of two attempts that end as badly, the one that lasts longer costs less.
+def worst_cost(demonstrations: Sequence[Trajectory]) -> float:
+    """Return the largest cost of a step in any demonstration: what all attempts are held against.
 
     Raises
     ------
     MisstepError
         If no costs were recorded.
     """
+    return max(float(_costs_of(demonstration).max()) for demonstration in demonstrations)
+
+
+def excess_cost(attempt: Trajectory, worst: float) -> float:
+    """Return Σ (cost − worst) of an attempt's steps; each step that was not the worst lowers it.
+
+    Of two attempts whose steps cost the same, the one that lasts longer has less. The worst cost
+    has to be the same for all that are compared: by its own, a success, whose worst step is a good
+    one, would seem worse than the falls that it came from.
+
+    Raises
+    ------
+    MisstepError
+        If no costs were recorded.
+    """
+    return float((_costs_of(attempt) - worst).sum())
+
+
+def _costs_of(attempt: Trajectory) -> Array:
     if attempt.costs is None:
         raise MisstepError("an attempt has no costs: this learner needs the cost of each step")
-    return float(attempt.costs.sum() - attempt.costs.max() * attempt.n_steps)
+    return attempt.costs
 
 
-def _rewards(attempts: Sequence[Trajectory]) -> Array:
+def _rewards(attempts: Sequence[Trajectory], worst: float) -> Array:
     """Return a positive reward for each attempt: exp(−cost) in units of the costs' spread."""
-    costs = np.array([total_cost(t) for t in attempts])
+    costs = np.array([excess_cost(t, worst) for t in attempts])
     spread = costs.std()
     return np.ones(len(costs)) if spread == 0 else np.exp(-(costs - costs.min()) / spread)

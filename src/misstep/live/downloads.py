@@ -20,7 +20,7 @@ def show_formats() -> list[dict[str, Any]]:
     """Return the formats in which recordings can be downloaded."""
     return [
         {"name": name, "description": entry.description, "suffix": _suffix(name)}
-        for name, entry in FORMATS.items()
+        for name, entry in FORMATS.loaded()[0].items()
         if entry.write is not None
     ]
 
@@ -36,7 +36,7 @@ def upload_suffix(name: str) -> str:
         If no format goes by it.
     """
     suffix = Path(name).suffix.lower()
-    files = [entry for entry in FORMATS.values() if not entry.is_folder]
+    files = [entry for entry in FORMATS.loaded()[0].values() if not entry.is_folder]
     known = sorted({PACKED, *(s for e in files for s in (*e.suffixes, *e.read_suffixes))})
     if suffix not in known:
         raise MisstepError(

@@ -41,7 +41,7 @@ def unfit_learners(attempts: Iterable[Kept], system: System) -> dict[str, str]:
     trajectories = [kept.trajectory for kept in attempts]
     failed = any(trajectory.failure_step is not None for trajectory in trajectories)
     reasons = {}
-    for name, kind in LEARNERS.items():
+    for name, kind in LEARNERS.loaded()[0].items():
         if not trajectories:
             reasons[name] = "keep at least one failed attempt first"
         elif kind.rung >= 4 and system.cost is None:

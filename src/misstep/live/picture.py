@@ -126,14 +126,15 @@ def title_of(name: str) -> str:
 def show_systems() -> list[Shown]:
     """Return the systems of the registry."""
     return [
-        {"name": n, "title": title_of(n), "task": _first_line(SYSTEMS[n].__doc__)} for n in SYSTEMS
+        {"name": name, "title": title_of(name), "task": _first_line(kind.__doc__)}
+        for name, kind in SYSTEMS.loaded()[0].items()
     ]
 
 
 def show_learners() -> list[Shown]:
     """Return the learners, each with its rung and one sentence."""
     shown = []
-    for name, kind in LEARNERS.items():
+    for name, kind in LEARNERS.loaded()[0].items():
         sentence = _first_line(kind.__doc__).partition(": ")[2]
         shown.append(
             {

@@ -38,6 +38,7 @@ from misstep.robot.numbering import next_number
 from misstep.robot.reported import ReportedTrial
 from misstep.rollout import Policy, utc_now
 from misstep.runs import Run
+from misstep.seeds import Stream, stream_of
 from misstep.storage import make_folder
 from misstep.systems import System
 from misstep.threads import thread_pool
@@ -496,7 +497,7 @@ class ExplorationService:
         return None if self.run.finished else propose(self.run, self._task)
 
     def _same_policy(self) -> Proposal:
-        stream = np.random.SeedSequence(self.run.config.seed, spawn_key=(2, self._n_kept()))
+        stream = stream_of(self.run.config.seed, Stream.DRIVE, self._n_kept())
         demonstrator = f"learner:{self.run.config.learner}"
         return Proposal(self.run.policy, int(stream.generate_state(1)[0]), demonstrator, 0.0)
 

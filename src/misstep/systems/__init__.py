@@ -95,4 +95,5 @@ def make_system(name: str, /, **parameters: ParameterValue | Judge) -> System:
 
 def list_systems() -> dict[str, list[ParameterRow]]:
     """Return the table of parameters (name, default, unit, meaning) of every system by name."""
-    return {name: parameter_table(SYSTEMS[name].parameters_type) for name in SYSTEMS}
+    kinds = SYSTEMS.loaded()[0]
+    return {name: parameter_table(kind.parameters_type) for name, kind in kinds.items()}

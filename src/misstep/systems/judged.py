@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from misstep.errors import MisstepError
 from misstep.judges import Formula, Judge, parse_cost, parse_predicate
 from misstep.parameters import ParameterRow, ParameterValue
+from misstep.systems.mechanics import Mechanics
 from misstep.systems.simulated import LONGEST_TIME
 from misstep.systems.system import System
 
@@ -178,6 +179,10 @@ class Judged(System):
                 f"{self.system_id}: the cost {cost.text!r} is {value} at {seen}: it must be finite"
             )
         return value
+
+    def mechanics(self, **parameters: ParameterValue) -> Mechanics:
+        """Return the joints and forces of the system inside; see `System.mechanics`."""
+        return self.system.mechanics(**parameters)
 
     def render(self) -> Any:
         """Return what the system renders."""

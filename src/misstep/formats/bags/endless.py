@@ -8,10 +8,11 @@ parenthesis inside another, and has not been seen to end for ten: definitions ne
 
 import re
 import sqlite3
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import Any
 from urllib.parse import quote
 
@@ -95,18 +96,55 @@ def check_types(types: dict[str, Any]) -> None:
             raise MisstepError(f"a message of {name} has {count} parts: at most {_MOST_PARTS}")
 
 
-@cache
-def refuse_endless_texts() -> None:
+@contextmanager
+def endless_texts_refused() -> Iterator[None]:
     """Have rosbags refuse YAML with aliases, and definitions that are long or deeply nested.
 
-    It looks these functions up where they are replaced here, once for the whole process.
+    It looks these functions up where they are replaced here.
     """
     from rosbags.highlevel import anyreader
     from rosbags.rosbag2 import metadata, reader
 
-    metadata.YAML = reader.YAML = _plain_yaml
-    anyreader.get_types_from_msg = _bounded(anyreader.get_types_from_msg)
-    anyreader.get_types_from_idl = _bounded(anyreader.get_types_from_idl, _check_idl)
+    from_msg, from_idl = anyreader.get_types_from_msg, anyreader.get_types_from_idl
+    with (
+        replaced(vars(metadata), YAML=_plain_yaml),
+        replaced(vars(reader), YAML=_plain_yaml),
+        replaced(
+            vars(anyreader),
+            get_types_from_msg=_bounded(from_msg),
+            get_types_from_idl=_bounded(from_idl, _check_idl),
+        ),
+    ):
+        yield
+
+
+_replacements: dict[tuple[int, str], tuple[int, Any]] = {}
+_counting = Lock()
+
+
+@contextmanager
+def replaced(table: dict[str, Any], **values: Any) -> Iterator[None]:
+    """Replace entries of a library's table while anybody here needs it: then they are as before.
+
+    Bags may be open side by side, so that the first who comes replaces and the last who goes puts
+    back.
+    """
+    with _counting:
+        for name, value in values.items():
+            count, before = _replacements.get((id(table), name), (0, table[name]))
+            _replacements[id(table), name] = count + 1, before
+            if count == 0:
+                table[name] = value
+    try:
+        yield
+    finally:
+        with _counting:
+            for name in values:
+                count, before = _replacements.pop((id(table), name))
+                if count > 1:
+                    _replacements[id(table), name] = count - 1, before
+                else:
+                    table[name] = before
 
 
 def _plain_yaml(typ: str) -> Any:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from misstep.errors import MisstepError
-from misstep.formats.bags.endless import check_base, check_types, refuse_endless_texts
+from misstep.formats.bags.endless import check_base, check_types, endless_texts_refused, replaced
 from misstep.formats.libraries import library_errors
 
 if TYPE_CHECKING:
@@ -54,28 +54,28 @@ def opened(path: Path) -> Iterator[tuple["AnyReader", Unpack]]:
     metadata = path / "metadata.yaml"
     if metadata.is_file() and metadata.stat().st_size > _LARGEST_YAML:
         raise MisstepError("metadata.yaml is too large to be one")
-    storage_mcap.DECOMPRESSORS.update(
+    with replaced(
+        storage_mcap.DECOMPRESSORS,
         lz4=lambda packed, size: _unpacked(_lz4(), packed, size),
         zstd=lambda packed, size: _unpacked(_zstd(), packed, size),
-    )
-    refuse_endless_texts()
-    with library_errors("it"):
-        for file in sorted(path.iterdir()) if path.is_dir() else (path,):
-            if file.is_file():
-                _check_file(file)
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-        reader.open()
-    try:
-        with library_errors("it"):
-            reader.typestore.max_sequence_length = _LONGEST_ARRAY
-            check_types(reader.typestore.fielddefs)
-            unpack: Unpack = bytes
-            for part in reader.readers:
-                unpack = _bound(part)
-        yield reader, unpack
-    finally:
-        with library_errors("it"):
-            reader.close()
+    ):
+        with library_errors("it"), endless_texts_refused():
+            for file in sorted(path.iterdir()) if path.is_dir() else (path,):
+                if file.is_file():
+                    _check_file(file)
+            reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            reader.open()
+        try:
+            with library_errors("it"):
+                reader.typestore.max_sequence_length = _LONGEST_ARRAY
+                check_types(reader.typestore.fielddefs)
+                unpack: Unpack = bytes
+                for part in reader.readers:
+                    unpack = _bound(part)
+            yield reader, unpack
+        finally:
+            with library_errors("it"):
+                reader.close()
 
 
 def _bound(part: Any) -> Unpack:
