@@ -133,7 +133,7 @@ def _check_file(file: Path) -> None:
     with open(file, "rb") as start:
         beginning = start.read(len(_SQLITE))
     magic = _MAGIC.get(file.suffix.lower(), b"")
-    if not beginning.startswith(magic):
+    if beginning and not beginning.startswith(magic):
         raise MisstepError(f"{file.name} does not begin as a {file.suffix} file does")
     if beginning == _SQLITE:
         check_base(file)
