@@ -370,9 +370,30 @@ def test_a_package_that_cannot_be_loaded_is_told_in_one_line(here, tmp_path, mon
     (told / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
     (told / "entry_points.txt").write_text("[misstep.learners]\nbroken = no_such_place:Learner\n")
     monkeypatch.syspath_prepend(tmp_path)
-    line = refused(capsys, "list", "learners")
+    line = refused(capsys, "learn", "cartpole", "--from", "D.h5", "--learner", "broken")
     assert "the learner 'broken' is no_such_place:Learner of an installed package" in line
     assert "No module named 'no_such_place'" in line
+
+
+@pytest.mark.parametrize("what", ["learners", "systems", "demonstrators", "formats"])
+def test_one_broken_package_leaves_the_others_to_be_used(here, tmp_path, monkeypatch, capsys, what):
+    module = tmp_path / "mishap_of_somebody.py"
+    module.write_text("raise RuntimeError('this package is broken')\n")
+    told = tmp_path / "broken-1.0.dist-info"
+    told.mkdir()
+    (told / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
+    (told / "entry_points.txt").write_text(f"[misstep.{what}]\nbroken = mishap_of_somebody:THING\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert main(["list", what, "--json", "listed.json"]) == 0
+    out = capsys.readouterr().out
+    assert "this package is broken" in out
+    listed = json.loads(Path("listed.json").read_text())
+    assert set(listed["broken"]) == {"broken"}
+    assert "broken" not in listed[what]
+    assert len(listed[what]) > 3
+    # Reading, writing, driving and learning go on.
+    assert main(["convert", "D.h5", "copy.csv"]) == 0
+    assert main(["demonstrate", "cartpole", "-n", "1", "--out", "other.h5"]) == 0
 
 
 def empty(path):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -187,6 +189,21 @@ def test_several_actions_each_get_a_gain():
     assert gain.shape == (2, 3)
     # The second action does nothing, so hardly anything is asked of it.
     assert np.abs(gain[1]).max() < 0.2 * np.abs(gain[0]).max()
+
+
+def test_an_attempt_that_began_as_a_failure_says_nothing():
+    system = make_system("cartpole")
+    shown = demonstrate(system, "weak", n=4, seed=0)
+    fallen = replace(shown[0], failure_step=0)
+    task = Task.of(system, STATE)
+
+    def gain(demonstrations):
+        evidence = Evidence(tuple(demonstrations), ())
+        return LEARNERS["fall"]().policy(task, evidence, np.random.default_rng(0)).gain
+
+    np.testing.assert_array_equal(gain([*shown, fallen]), gain(shown))
+    with pytest.raises(MisstepError, match="at least one failure, after the start of its attempt"):
+        gain([fallen])
 
 
 def test_needs_a_failure_time():

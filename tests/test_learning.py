@@ -28,6 +28,7 @@ from misstep import (
 from misstep.learning import wilson_interval
 from misstep.systems import CartPole
 from misstep.trajectory import Column, Outcome
+from misstep.version import __version__
 
 STATE = ("theta", "theta_dot")
 
@@ -469,3 +470,34 @@ def test_a_policy_file_with_flipped_bytes_is_read_or_refused(kept):
             assert len(run.policies) == 3
     assert len(refusals) > 100
     assert not any("\n" in refusal for refusal in refusals)
+
+
+def test_no_test_starts_where_a_trial_did(monkeypatch):
+    # With the command lines' own defaults, a run and its evaluation have the same seed.
+    system, starts = make_system("cartpole"), []
+    shown = demonstrate(system, "weak", n=4, seed=0)
+    reset = system.reset
+
+    def watched(*, seed=None, options=None):
+        starts.append(seed)
+        return reset(seed=seed, options=options)
+
+    monkeypatch.setattr(system, "reset", watched)
+    run = learn(system, shown, "mean", max_trials=20, seed=0, stop_on_success=False)
+    tried, starts[:] = set(starts), []
+    evaluate(system, run.policy, episodes=20, seed=0)
+    assert len(tried) == len(set(starts)) == 20
+    assert not tried & set(starts)
+
+
+def test_a_run_of_another_version_says_which_trials_are_not_of_it(tmp_path):
+    system = make_system("cartpole")
+    shown = demonstrate(system, "weak", n=4, seed=0)
+    learn(system, shown, "mean", max_trials=1, stop_on_success=False, out=tmp_path / "run")
+    config = json.loads((tmp_path / "run" / "run.json").read_text())
+    config.update(max_trials=2, version="0.0.1")
+    (tmp_path / "run" / "run.json").write_text(json.dumps(config))
+    resume(load_run(tmp_path / "run"))
+    first, second = load_run(tmp_path / "run").trials
+    assert first.provenance.notes == ()
+    assert second.provenance.notes == (f"made by misstep {__version__}, of a run that 0.0.1 began",)

@@ -9,7 +9,7 @@ from misstep import demonstrate, learn, make_system
 from misstep.errors import MisstepError
 from misstep.learners import LEARNERS, Evidence, Task
 from misstep.learners.linear import LinearPolicy, LinearSpace, time_lasted
-from misstep.learners.search import total_cost
+from misstep.learners.search import excess_cost, worst_cost
 from misstep.trajectory import Column, Outcome, Provenance, Trajectory
 
 STATE = ("theta", "theta_dot")
@@ -103,9 +103,29 @@ def test_longer_balance_costs_less():
         costs=np.concatenate([np.full(50, trial.costs[0]), trial.costs]),
         failure_step=trial.failure_step + 50,
     )
-    assert total_cost(longer) < total_cost(trial)
+    worst = worst_cost([trial])
+    assert excess_cost(longer, worst) < excess_cost(trial, worst)
     with pytest.raises(MisstepError, match="needs the cost of each step"):
-        total_cost(replace(trial, costs=None))
+        excess_cost(replace(trial, costs=None), worst)
+
+
+def test_a_success_costs_less_than_the_falls_it_came_from(system, shown):
+    # Also a success that wavers: against its own worst step it would cost more than a fall.
+    run = learn(system, shown, "fall", state=STATE, max_trials=5)
+    success = run.trials[-1]
+    assert success.outcome is Outcome.SUCCESS
+    worst = worst_cost(shown)
+    assert excess_cost(success, worst) < min(excess_cost(fall, worst) for fall in shown)
+    assert worst > success.costs.max()
+
+
+@pytest.mark.parametrize("learner", ["cma-es", "dynamics-policy"])
+def test_a_search_leaves_numpys_own_generator_alone(system, shown, learner):
+    settings = {"generations": 2} if learner == "dynamics-policy" else {}
+    np.random.seed(5)  # noqa: NPY002
+    before = np.random.get_state()[1].copy()  # noqa: NPY002
+    learn(system, shown, learner, state=STATE, max_trials=1, **settings)
+    np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
 
 
 # Between the failures: the action is a speed along a stroke, s(p) = strength · (1 + p).

@@ -1,6 +1,6 @@
 import copy
 import pickle
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -173,6 +173,17 @@ def test_the_first_bad_value_is_named(data):
         make(5, observations=observations)
 
 
+def test_a_part_has_an_outcome_only_if_it_was_decided_in_it():
+    whole = make(outcome="success")
+    assert whole.cut(3) == whole
+    assert whole.cut(2).outcome is Outcome.UNKNOWN
+    failed = make(outcome="failure", failure_step=2)
+    assert (failed.cut(2).outcome, failed.cut(2).failure_step) == (Outcome.FAILURE, 2)
+    assert (failed.cut(1).outcome, failed.cut(1).failure_step) == (Outcome.UNKNOWN, None)
+    untimed = make(outcome="failure")
+    assert untimed.cut(1).outcome is Outcome.UNKNOWN
+
+
 @pytest.mark.parametrize("step", [0, 3, np.int64(2)])
 def test_failure_step_may_be_any_observation(step):
     assert make(failure_step=step).failure_step == step
@@ -210,6 +221,23 @@ def test_bad_provenance_is_refused(changes, line):
     with pytest.raises(MisstepError, match=line) as caught:
         Provenance(**{**fields, **changes})
     assert "\n" not in str(caught.value)
+
+
+def test_a_provenance_can_be_a_key_and_a_dictionary():
+    source = Provenance("cartpole", {"mass": 1.0, "noisy": True}, "person", 3, "")
+    assert hash(source) == hash(replace(source))
+    assert {source: 1}[replace(source, parameters={"noisy": True, "mass": 1.0})] == 1
+    assert asdict(source)["parameters"] == {"mass": 1.0, "noisy": True}
+    for change in (
+        lambda p: p.update(mass=2.0),
+        lambda p: p.__setitem__("mass", 2.0),
+        lambda p: p.pop("mass"),
+        lambda p: p.clear(),
+        lambda p: p.__ior__({"mass": 2.0}),
+    ):
+        with pytest.raises(TypeError, match="cannot be changed"):
+            change(source.parameters)
+    assert dict(source.parameters) == {"mass": 1.0, "noisy": True}
 
 
 def test_parameters_become_plain_python_values():

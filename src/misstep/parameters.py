@@ -92,7 +92,7 @@ def parameter_table(kind: type) -> list[ParameterRow]:
     """
     if not is_dataclass(kind):
         raise MisstepError(
-            f"{kind.__name__} is no dataclass: parameters are the fields of a frozen dataclass, each "
+            f"{kind.__name__} is no dataclass: parameters are the fields of a frozen one, each "
             "declared by misstep.parameters.parameter"
         )
     for f in fields(kind):
@@ -150,8 +150,8 @@ def _of_type(f: Field[Any], wanted: Any, value: Any, owner: str) -> ParameterVal
         raise MisstepError(
             f"{owner}: {f.name} is declared as {wanted}: a parameter is a float, int, bool or str"
         )
-    if isinstance(value, np.bool_):
-        value = bool(value)
+    if isinstance(value, np.generic):
+        value = value.item()
     number = isinstance(value, numbers.Real) and not isinstance(value, bool)
     finite = number and -LARGEST <= value <= LARGEST
     if wanted is float and finite:
