@@ -6,9 +6,11 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -582,3 +584,58 @@ def test_a_cluster_that_is_not_there_is_told_in_one_line(spec, tmp_path):
     assert done.stderr.startswith("misstep: error: cannot join a Ray cluster at auto (")
     assert done.stderr.count("\n") == 1
     assert not out.exists()
+
+
+def wait_until(is_so, seconds):
+    deadline = time.monotonic() + seconds
+    while not is_so():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+@needs_ray
+@pytest.mark.parametrize("address", ["127.0.0.1:6399", "auto", ""])
+def test_a_cluster_that_the_surroundings_name_is_not_joined_unasked(spec, whole, tmp_path, address):
+    words = ("--out", tmp_path / "out", "--engine", "ray", "--workers", 1)
+    done = run(spec, *words, RAY_ADDRESS=address)
+    assert done.returncode == 0, done.stderr
+    assert tables(tmp_path / "out") == tables(whole)
+
+
+@needs_ray
+def test_beside_a_cluster_two_studies_at_once_run_on_their_own_or_join_it(spec, whole, tmp_path):
+    # Ray's sockets lie there, and the path of a socket has to be short.
+    notes = tempfile.mkdtemp(prefix="ray")
+    surroundings = {**os.environ, "RAY_TMPDIR": notes, "RAY_USAGE_STATS_ENABLED": "0"}
+    ray = Path(sys.executable).with_name("ray")
+    start = [ray, "start", "--head", "--node-ip-address=127.0.0.1", "--port=0", "--num-cpus=2"]
+    # In a session of its own, to be ended alone: `ray stop` would end every cluster of the machine.
+    head = subprocess.Popen(
+        [*start, "--include-dashboard=false", "--block"],
+        env=surroundings,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    try:
+        wait_until(Path(notes, "ray", "ray_current_cluster").exists, 60)
+        study = [sys.executable, "-m", "misstep", "study", spec, "--engine=ray", "--workers=1"]
+        started = [
+            subprocess.Popen(
+                [*study, "--out", tmp_path / name, *words],
+                env=surroundings,
+                stderr=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                text=True,
+            )
+            for name, words in (("alone", []), ("joined", ["--address", "auto"]))
+        ]
+        for process in started:
+            assert process.wait(240) == 0, process.stderr.read()
+            process.stderr.close()
+    finally:
+        os.killpg(head.pid, signal.SIGTERM)
+        head.wait(60)
+        shutil.rmtree(notes, ignore_errors=True)
+    for name in ("alone", "joined"):
+        assert tables(tmp_path / name) == tables(whole)

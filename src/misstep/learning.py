@@ -143,14 +143,15 @@ def resume(run: Run, *, system: System | None = None, on_trial: OnTrial | None =
     """
     system = run.config.make_system() if system is None else system
     task = Task.of(system, run.config.state)
-    while not run.finished:
-        proposal = propose(run, task)
-        trial = rollout(
-            system, proposal.policy, seed=proposal.seed, demonstrator=proposal.demonstrator
-        )
-        run.add(proposal.policy, trial, proposal.seconds)
-        if on_trial is not None:
-            on_trial(run)
+    with run.driven():
+        while not run.finished:
+            proposal = propose(run, task)
+            trial = rollout(
+                system, proposal.policy, seed=proposal.seed, demonstrator=proposal.demonstrator
+            )
+            run.add(proposal.policy, trial, proposal.seconds)
+            if on_trial is not None:
+                on_trial(run)
     return run
 
 

@@ -7,6 +7,7 @@ A run folder holds
     policies/trial_000.npz    the policy of each trial, plain arrays
     trials/trial_000.h5       each finished trial
 
+While it is driven, a hidden file is locked (`misstep.locks`), so that a second process is refused.
 A trial is finished when its file is there: the file appears in one step, after the policy's. A
 process killed at any instant therefore loses at most the trial in flight.
 """
@@ -16,7 +17,8 @@ import os
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
@@ -27,6 +29,7 @@ from numpy.typing import NDArray
 from misstep.errors import MisstepError, reason_of
 from misstep.formats import load_dataset, save_dataset
 from misstep.learners import LEARNERS, LearnedPolicy, Learner, Task
+from misstep.locks import driven
 from misstep.parameters import ParameterValue, build_parameters
 from misstep.storage import atomic_write, make_folder, read_json, write_json
 from misstep.systems import System
@@ -180,10 +183,36 @@ class Run:
         enough = len(self.trials) >= self.config.max_trials
         return enough or (self.config.stop_on_success and self.succeeded)
 
+    @contextmanager
+    def driven(self) -> Iterator[None]:
+        """Be the only one who adds trials to the run's folder, if it has one.
+
+        Raises
+        ------
+        MisstepError
+            If another process does; or has done since the run was loaded.
+        """
+        if self.folder is None:
+            yield
+            return
+        with driven(self.folder):
+            kept = sum(1 for _ in (self.folder / "trials").glob("trial_*.h5"))
+            if kept != len(self.trials):
+                raise MisstepError(
+                    f"{self.folder} holds {kept} trials, but {len(self.trials)} when it was "
+                    "loaded: somebody else has gone on with it; load it again"
+                )
+            yield
+
     def add(self, policy: LearnedPolicy, trial: Trajectory, seconds: float) -> None:
         """Append a finished trial, on disk first if the run has a folder.
 
         Where another version of misstep began the run, the trial says so.
+
+        Raises
+        ------
+        MisstepError
+            If the folder cannot be written, or holds a trial of that number.
         """
         if self.config.version != __version__:
             note = f"made by misstep {__version__}, of a run that {self.config.version} began"
@@ -191,6 +220,10 @@ class Run:
             trial = replace(trial, provenance=replace(source, notes=(*source.notes, note)))
         if self.folder is not None:
             name = f"trial_{len(self.trials):03d}"
+            if (self.folder / "trials" / f"{name}.h5").exists():
+                raise MisstepError(
+                    f"{self.folder} holds {name} already: somebody else has gone on with it"
+                )
             arrays = {**policy.arrays(), "computing_seconds": np.array(seconds)}
             _save_arrays(self.folder / "policies" / f"{name}.npz", arrays)
             save_dataset(Dataset([trial]), self.folder / "trials" / f"{name}.h5")
@@ -215,11 +248,12 @@ class Run:
         others = {file.name for file in path.glob("[!.]*")} - own
         if others or any((path / "trials").glob("[!.]*")):
             raise MisstepError(f"{path} is not empty: choose a new or an empty folder for the run")
-        make_folder(path / "policies")
-        make_folder(path / "trials")
-        save_dataset(self.demonstrations, path / DEMONSTRATIONS)
-        # Written last: a folder with a configuration is a run, whole.
-        write_json(path / CONFIG, asdict(self.config))
+        with driven(path):
+            make_folder(path / "policies")
+            make_folder(path / "trials")
+            save_dataset(self.demonstrations, path / DEMONSTRATIONS)
+            # Written last: a folder with a configuration is a run, whole.
+            write_json(path / CONFIG, asdict(self.config))
         self.folder = path
         return self
 

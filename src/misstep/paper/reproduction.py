@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
+from misstep.locks import driven
 from misstep.paper import figures, report, tables
 from misstep.paper.claims import Sample, judge_all
 from misstep.paper.experiments import PHYSICS, VARIANTS, Variant, build_system, run_cell
@@ -128,7 +129,8 @@ def reproduce(
         if any(out.glob("[!.]*")):
             raise MisstepError(f"{out} is not empty: choose a new or an empty folder")
         write_json(path, {**asdict(config), "command": list(command_line())})
-    return _run(out, config, processes, progress or silent)
+    with driven(out):
+        return _run(out, config, processes, progress or silent)
 
 
 def resume(out: Path, *, workers: int | None = None, progress: Progress | None = None) -> Path:

@@ -20,6 +20,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import ExitStack
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -118,7 +119,8 @@ class ExplorationService:
     Raises
     ------
     MisstepError
-        If the limits do not fit, the trial is shorter than a step, or the log cannot be written.
+        If the limits do not fit, the trial is shorter than a step, the log cannot be written, or
+        somebody else drives the run.
     """
 
     def __init__(
@@ -151,7 +153,13 @@ class ExplorationService:
         self._lock = threading.Lock()
         self._trial: ReportedTrial | None = None
         self._unkept: tuple[Proposal, Trajectory] | None = None
-        self._log = self._open_log()
+        self._driving = ExitStack()
+        self._driving.enter_context(run.driven())
+        try:
+            self._log = self._open_log()
+        except MisstepError:
+            self._driving.close()
+            raise
         self._pool = thread_pool(1, "learning")
         self._job: Future[Proposal | None] = self._pool.submit(self._learn, None)
 
@@ -354,10 +362,11 @@ class ExplorationService:
             log, self._log = self._log, None
         if log is not None:
             log.close()
-        if self._unkept is not None:
-            self._keep(*self._unkept)  # the disk may have room by now
-        elif (error := self._job.exception()) is not None:
-            raise error
+        with self._driving:
+            if self._unkept is not None:
+                self._keep(*self._unkept)  # the disk may have room by now
+            elif (error := self._job.exception()) is not None:
+                raise error
 
     def _ask(
         self, policy: Policy, observation: NDArray[np.float64]

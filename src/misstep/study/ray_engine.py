@@ -88,7 +88,10 @@ def _session(workers: int | None, address: str | None) -> Iterator[Any]:
     """Start Ray or join a cluster, and leave it at the end."""
     ray = _import_ray()
     if address is None:
+        # A cluster of its own, also where another one runs here or RAY_ADDRESS names one: without
+        # this word Ray would join that one, and refuse to be told how many processes to use.
         options: dict[str, Any] = {
+            "address": "local",
             "num_cpus": workers,
             "include_dashboard": False,
             "_node_ip_address": "127.0.0.1",

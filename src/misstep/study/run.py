@@ -20,6 +20,7 @@ from functools import partial
 from pathlib import Path
 
 from misstep.errors import MisstepError
+from misstep.locks import driven
 from misstep.storage import make_folder, read_json, write_json, write_text
 from misstep.study import figures, markdown, page, table
 from misstep.study.cells import CellResult, Video, cell_file, run_cell, write_first_success
@@ -89,16 +90,19 @@ def run_study(
     processes = check_workers(workers)
     run = _engine(engine, workers, address)
     _claim(out, study)
-    missing = [cell for cell in study.cells if not _is_done(out, cell)]
-    total = len(study.cells)
-    tally = Tally(progress or silent, total, done=total - len(missing))
-    for cell, result in run(missing) if missing else ():
-        if isinstance(result, Lost):
-            result = CellResult("lost", f"lost: {result.reason}", tests=cell.tests)
-        _save(out, cell, result)
-        tally.count(f"{cell.title}: {result.summary}")
-    measured = [table.Measured(cell, CellResult.load(cell_file(out, cell))) for cell in study.cells]
-    return _write(out, study, measured, processes, tally)
+    with driven(out):
+        missing = [cell for cell in study.cells if not _is_done(out, cell)]
+        total = len(study.cells)
+        tally = Tally(progress or silent, total, done=total - len(missing))
+        for cell, result in run(missing) if missing else ():
+            if isinstance(result, Lost):
+                result = CellResult("lost", f"lost: {result.reason}", tests=cell.tests)
+            _save(out, cell, result)
+            tally.count(f"{cell.title}: {result.summary}")
+        measured = [
+            table.Measured(cell, CellResult.load(cell_file(out, cell))) for cell in study.cells
+        ]
+        return _write(out, study, measured, processes, tally)
 
 
 def held_study(out: Path) -> Study:
