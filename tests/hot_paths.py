@@ -18,7 +18,7 @@ def em_pass(d, K):
     X = rng.normal(size=(em.BLOCK, d))
     samples = em.in_blocks(X, np.ones(len(X)))
     room = em.Moments.room_for(1, K, d), em.Work.room_for(K, d)
-    rule = em.Rule(0.0, 0.0, 0)
+    rule = em.Rule(np.zeros(d), 0.0, 0)
 
     def start():
         return em.Mixture(np.full(K, 1.0 / K), X[:K].copy(), np.array([np.eye(d)] * K))

@@ -142,11 +142,23 @@ def test_units_do_not_matter(random_mixture, seed, exponents):
     np.testing.assert_allclose(scaled.covariances, plain.covariances * scale[2] ** 2, rtol=1e-6)
 
 
-@pytest.mark.parametrize("given_columns", [[], [0, 1, 2], [0, 0], [3], [-1], [0, 7]])
-def test_refuses_columns_that_are_not_some_of_the_mixture_s(refused, given_columns):
+@pytest.mark.parametrize(
+    "given_columns", [[], [0, 0], [3], [-1], [0, 7], [1.7], 1, ["0"], None, [[0]]]
+)
+def test_refuses_columns_that_are_not_of_the_mixture(refused, given_columns):
+    mixture = GaussianMixture.from_parameters([1.0], np.zeros((1, 3)), [np.eye(3)])
+    line = "columns are given as a list of distinct whole numbers from 0 to 2"
+    with refused(line):
+        Conditioner(mixture, given_columns)
+    with refused(line):
+        mixture.condition(given_columns, [0.0])
+
+
+def test_refuses_to_condition_on_all_columns(refused):
     mixture = GaussianMixture.from_parameters([1.0], np.zeros((1, 3)), [np.eye(3)])
     with refused("condition on some, not all, of the columns 0 to 2"):
-        Conditioner(mixture, given_columns)
+        Conditioner(mixture, [0, 1, 2])
+    assert Conditioner(mixture, np.array([2, 0])).at([0.0, 0.0]).means.shape == (1, 1)
 
 
 @pytest.mark.parametrize(

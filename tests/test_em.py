@@ -25,13 +25,13 @@ def step(samples, mixture, floor=0.0, panels=None):
     K, d = mixture.means.shape
     n_panels = em.panels_of(samples)
     moments = em.Moments.room_for(n_panels, K, d)
-    only_moments = em.Rule(0.0, 0.0, -1)
+    only_moments = em.Rule(np.zeros(d), 0.0, -1)
     for first, last in panels or [(0, n_panels)]:
         work = em.Work.room_for(K, d)
         em.iterate(samples, mixture, moments, work, first, last, 0.0, only_moments)
     em.add_panels(moments)
     mass = moments.mass[0].copy()
-    em.maximise(moments, mixture, floor)
+    em.maximise(moments, mixture, np.full(d, floor))
     return moments.log_likelihood[0], mass
 
 
@@ -139,7 +139,7 @@ def test_seeds_against_plain_k_means_plus_plus(seed, d, K, n):
     expected = distance.argmin(axis=1)
     np.testing.assert_array_equal(labels.reshape(-1)[:n], expected)
 
-    spread = starts.spread_of(X, weight, 1e-3)
+    spread = starts.spread_of(X, weight, np.full(X.shape[1], 1e-3))
     mixture = starts.moments_of(samples, n, labels, K, spread)
     scale = weight.sum() / n
     for k in range(K):

@@ -6,7 +6,7 @@ import sklearn.mixture
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logsumexp
-from sklearn.exceptions import NotFittedError
+from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.utils.estimator_checks import check_estimator
 from threadpoolctl import threadpool_limits
 
@@ -338,7 +338,15 @@ def test_scikit_learn_s_own_refusals(X, message):
         ({"tol": -1.0}, CLOUD, None, "tol must be ≥ 0"),
         ({"tol": "small"}, CLOUD, None, "tol must be ≥ 0"),
         ({"covariance_floor": math.nan}, CLOUD, None, "covariance_floor must be ≥ 0"),
-        ({"weights_init": [1.0]}, CLOUD, None, "a start needs"),
+        ({"reg_covar": -1.0}, CLOUD, None, "reg_covar must be ≥ 0"),
+        ({"covariance_type": "diag"}, CLOUD, None, "it is 'full', because conditioning"),
+        ({"init_params": "best"}, CLOUD, None, "there are: k-means"),
+        ({"verbose": 2}, CLOUD, None, "verbose cannot be set: the compiled loops"),
+        ({"random_state": "x"}, CLOUD, None, "random_state is 'x': it is a whole number"),
+        ({"random_state": 1.5}, CLOUD, None, "random_state is 1.5: it is a whole number"),
+        ({"random_state": -1}, CLOUD, None, "random_state is -1: it is a whole number"),
+        ({"means_init": "here"}, CLOUD, None, "means_init has to be an array of numbers"),
+        ({"n_components": 2, "means_init": [[0.0, 1.0, 2.0]] * 2}, CLOUD, None, r"take \(2, 2\)"),
     ],
 )
 def test_one_line_of_refusal(refused, settings, X, weight, message):
@@ -367,7 +375,7 @@ GOOD_START = {
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"means_init": [[0.0, 0.0]]}, r"means \(2, 2\)"),
+        ({"means_init": [[0.0, 0.0]]}, r"2 columns take \(2, 2\)"),
         ({"weights_init": [0.5, -0.5]}, "weights_init"),
         ({"weights_init": [0.5, math.nan]}, "weights_init"),
         ({"means_init": [[0.0, math.inf], [1.0, 1.0]]}, "means_init"),
@@ -405,7 +413,7 @@ def test_parameters_are_checked(refused, weights, means, covariances, message):
 def test_queries_are_checked(refused):
     mixture = GaussianMixture(2, random_state=0).fit(CLOUD)
     for columns in ([], [0, 0], [2], [-1]):
-        with refused("columns must be distinct numbers from 0 to 1"):
+        with refused("columns are given as a list of distinct whole numbers from 0 to 1"):
             mixture.marginal(columns)
     with refused("n_samples must be at least 1"):
         mixture.sample(0)
@@ -421,3 +429,122 @@ def test_says_when_it_did_not_converge(random_mixture):
         mixture = GaussianMixture(3, max_iter=2, random_state=0).fit(X)
     assert not mixture.converged_
     assert mixture.n_iter_ == 2
+
+
+# The names of scikit-learn's own mixture
+
+
+def two_blobs(n=120, seed=0):
+    rng = np.random.default_rng(seed)
+    return np.concatenate([rng.normal(-3.0, 1.0, (n, 2)), rng.normal(3.0, 0.5, (n, 2))])
+
+
+@pytest.mark.parametrize("start", ["k-means++", "kmeans", "random_from_data", "random"])
+def test_every_kind_of_start_finds_what_is_there(start):
+    fitted = GaussianMixture(2, init_params=start, random_state=0, max_iter=5000).fit(two_blobs())
+    order = np.argsort(fitted.means_[:, 0])
+    np.testing.assert_allclose(fitted.means_[order], [[-3.0, -3.0], [3.0, 3.0]], atol=0.3)
+    np.testing.assert_allclose(fitted.weights_, 0.5, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    "random_state",
+    [3, np.int64(3), np.random.RandomState(3), np.random.default_rng(3), None],
+)
+def test_every_kind_of_random_state_is_taken(random_state):
+    fitted = GaussianMixture(random_state=random_state).fit(two_blobs())
+    assert fitted.n_components_ == 2
+    X, _ = fitted.sample(5, random_state)
+    assert X.shape == (5, 2)
+
+
+def test_a_random_state_of_numpys_old_kind_gives_the_same_twice():
+    one, other = (
+        GaussianMixture(3, random_state=np.random.RandomState(7)).fit(two_blobs()) for _ in range(2)
+    )
+    np.testing.assert_array_equal(one.means_, other.means_)
+
+
+def test_fit_predict_and_criteria():
+    X = two_blobs()
+    labels = GaussianMixture(2, random_state=0).fit_predict(X)
+    fitted = GaussianMixture(2, random_state=0).fit(X)
+    np.testing.assert_array_equal(labels, fitted.predict(X))
+    assert len(set(labels[:120])) == len(set(labels[120:])) == 1
+    log_likelihood = fitted.score_samples(X).sum()
+    n_free = 2 * 2 + 2 * 3 + 1
+    assert fitted.aic(X) == pytest.approx(2 * n_free - 2 * log_likelihood)
+    assert fitted.bic(X) == pytest.approx(n_free * math.log(len(X)) - 2 * log_likelihood)
+
+
+def test_precisions_are_the_inverses():
+    fitted = GaussianMixture(3, random_state=0).fit(two_blobs())
+    products = fitted.precisions_ @ fitted.covariances_
+    np.testing.assert_allclose(products, np.tile(np.eye(2), (3, 1, 1)), atol=1e-9)
+    upper = fitted.precisions_cholesky_
+    np.testing.assert_array_equal(upper, np.triu(upper))
+    np.testing.assert_allclose(upper @ upper.transpose(0, 2, 1), fitted.precisions_, rtol=1e-12)
+
+
+def test_a_start_may_be_given_in_part():
+    X = two_blobs()
+    begun = {"max_iter": 0, "random_state": 0}
+    with pytest.warns(ConvergenceWarning):
+        whole = GaussianMixture(2, **begun).fit(X)
+    parts = {
+        "weights_init": [0.25, 0.75],
+        "means_init": [[-2.0, -1.0], [1.0, 2.0]],
+        "precisions_init": [np.eye(2), 2.0 * np.eye(2)],
+    }
+    for name, value in parts.items():
+        with pytest.warns(ConvergenceWarning):
+            made = GaussianMixture(**begun, **{name: value}).fit(X)
+        assert made.n_components_ == 2  # as the part says
+        for part, own in (
+            ("weights_init", "weights_"),
+            ("means_init", "means_"),
+            ("precisions_init", "precisions_"),
+        ):
+            expected = value if part == name else getattr(whole, own)
+            np.testing.assert_allclose(getattr(made, own), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_a_second_fit_may_begin_where_the_first_ended():
+    X = two_blobs()
+    warm = GaussianMixture(3, warm_start=True, tol=1e-9, random_state=0)
+    first = warm.fit(X).n_iter_
+    assert warm.fit(X).n_iter_ < first
+    start = GaussianMixture(3, tol=1e-9, random_state=0).fit(X)
+    again = GaussianMixture(3, tol=1e-9, random_state=0, start=start).fit(X)
+    np.testing.assert_allclose(warm.means_, again.means_, rtol=1e-9)
+
+
+def test_a_floor_may_be_in_the_data_s_own_unit():
+    X = two_blobs() * [1.0, 1000.0]
+    plain = GaussianMixture(1, covariance_floor=0.0).fit(X)
+    raised = GaussianMixture(1, reg_covar=4.0).fit(X)
+    np.testing.assert_allclose(
+        raised.covariances_ - plain.covariances_, [4.0 * np.eye(2)], atol=1e-6
+    )
+
+
+def test_a_scan_says_whether_it_ended_at_its_largest():
+    X = two_blobs()
+    assert not GaussianMixture(random_state=0).fit(X).scan_ended_at_largest_
+    assert GaussianMixture(max_components=2, random_state=0).fit(X).scan_ended_at_largest_
+    assert not GaussianMixture(2, random_state=0).fit(X).scan_ended_at_largest_
+
+
+def test_a_weight_counts_as_so_many_samples_for_a_given_number_of_components_alone():
+    rng = np.random.default_rng(0)
+    X = np.concatenate([rng.normal(-1.2, 1.0, (60, 1)), rng.normal(1.2, 1.0, (60, 1))])
+    repeated = np.repeat(X, 4, axis=0)
+    weight = np.full(len(X), 4.0)
+    for K in (1, 2, 3):
+        one = GaussianMixture(K, random_state=0).fit(X, sample_weight=weight)
+        other = GaussianMixture(K, random_state=0).fit(repeated)
+        np.testing.assert_allclose(one.means_, other.means_, rtol=1e-6)
+    # The same spread over fewer samples is said with less certainty: by Kish's size, a quarter.
+    scanned = GaussianMixture(random_state=0).fit(X, sample_weight=weight)
+    assert scanned.bics_ == GaussianMixture(random_state=0).fit(X).bics_
+    assert GaussianMixture(random_state=0).fit(repeated).n_components_ > scanned.n_components_

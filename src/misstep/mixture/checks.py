@@ -1,6 +1,8 @@
 """What the mixture's borders check about matrices and points."""
 
 import math
+import operator
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,3 +40,17 @@ def checked_points(a: ArrayLike, d: int) -> Array:
     if points.ndim != 2 or points.shape[1] != d or not np.all(np.isfinite(points)):
         raise MisstepError(f"points are finite and have shape (N, {d}), got {points.shape}")
     return points
+
+
+def checked_columns(indices: Sequence[int], d: int) -> list[int]:
+    """Return `indices` as a list; raise MisstepError unless they are distinct columns of d."""
+    try:
+        columns = [operator.index(i) for i in indices]
+    except TypeError:
+        columns = []
+    if not columns or len(set(columns)) < len(columns) or not all(0 <= i < d for i in columns):
+        raise MisstepError(
+            f"columns are given as a list of distinct whole numbers from 0 to {d - 1}, got "
+            f"{indices!r}"
+        )
+    return columns

@@ -18,7 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from misstep.errors import MisstepError
 from misstep.mixture import compiled
-from misstep.mixture.checks import checked_points, whiteners_of
+from misstep.mixture.checks import checked_columns, checked_points, whiteners_of
 
 if TYPE_CHECKING:
     from misstep.mixture.gaussian_mixture import GaussianMixture
@@ -75,9 +75,9 @@ class Conditioner:
 
     def __init__(self, mixture: "GaussianMixture", given: Sequence[int]) -> None:
         joint = mixture.means_.shape[1]
-        known = [int(i) for i in given]
+        known = checked_columns(given, joint)
         others = [i for i in range(joint) if i not in known]
-        if not others or len(known) + len(others) != joint or not known:
+        if not others:
             raise MisstepError(
                 f"condition on some, not all, of the columns 0 to {joint - 1}, got {known}"
             )

@@ -109,7 +109,7 @@ class Work(NamedTuple):
 class Rule(NamedTuple):
     """When to stop, and how narrow a component may become."""
 
-    floor: float
+    floor: Array
     """Added to the diagonal of each covariance."""
     tol: float
     """Least rise of the mean log-likelihood that goes on."""
@@ -307,7 +307,7 @@ def maximise(moments, mixture, floor):
             first[k, j] /= mass[k]
             means[k, j] += first[k, j]
             step = first[k, j] * first[k, j]
-            told &= second[k, j, j] / mass[k] - step + floor > JUMP * step
+            told &= second[k, j, j] / mass[k] - step + floor[j] > JUMP * step
         # About so distant an old mean nothing is told of the spread about the new one: this time
         # only the mean moves, which raises the likelihood too (conditional maximisation).
         if not told:
@@ -317,7 +317,7 @@ def maximise(moments, mixture, floor):
                 s = second[k, j, m] / mass[k] - first[k, j] * first[k, m]
                 covariances[k, j, m] = s
                 covariances[k, m, j] = s
-            covariances[k, j, j] += floor
+            covariances[k, j, j] += floor[j]
 
 
 @njit(**COMPILED)

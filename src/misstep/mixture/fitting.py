@@ -199,7 +199,7 @@ def _moments(
     bounds = np.linspace(0, n_panels, min(threads, n_panels) + 1).astype(int).tolist()
     shares = list(pairwise(bounds))
     rooms = [Moments.room_for(n_panels, *fit.mixture.means.shape) for fit in fits]
-    only_moments = Rule(0.0, 0.0, -1)
+    only_moments = Rule(np.zeros(fits[0].mixture.means.shape[1]), 0.0, -1)
 
     def fill(task: tuple[Mixture, Moments, tuple[int, int]]) -> None:
         mixture, moments, share = task

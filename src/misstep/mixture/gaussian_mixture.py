@@ -14,13 +14,13 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from misstep.errors import MisstepError
 from misstep.mixture import compiled, em, fitting, starts
-from misstep.mixture.checks import whiteners_of
+from misstep.mixture.checks import checked_columns, whiteners_of
 from misstep.mixture.chunks import SUBSAMPLE, StandardisedChunks, survey
 from misstep.mixture.conditional import Conditional, Conditioner
 from misstep.mixture.em import Mixture, Rule, Samples
 
 Array = NDArray[np.float64]
-
+RandomState = int | np.random.Generator | np.random.RandomState | None
 
 # Rounding leaves what is constant a spread of some units in the last place.
 CONSTANT = 1e-13
@@ -40,8 +40,12 @@ class Ellipse(NamedTuple):
 class GaussianMixture(DensityMixin, BaseEstimator):
     """A Gaussian mixture on joint (state, action) samples, K chosen by minimum BIC.
 
-    A sample of weight w counts as w equal samples. Fitting standardises the data inside, so
-    tolerances and the covariance floor are in the data's own scale.
+    Fitting standardises the data inside, so tolerances and the covariance floor are in the data's
+    own scale. For a given K, a sample of weight w counts as w equal samples; over K it does not,
+    because weights say less than as many samples would (see Notes).
+
+    The names are those of scikit-learn's own `GaussianMixture`, of which this is the one with full
+    covariances, sample weights and a scan over K; defaults differ.
 
     Parameters
     ----------
@@ -49,37 +53,58 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         Number of components K. None scans 1 … `max_components` and keeps the least BIC.
     max_components : int, default=10
         Largest K of the scan; also bounded so that each component can have d + 1 samples.
+    covariance_type : str, default="full"
+        The only one there is: conditioning on a state needs every covariance.
     n_init : int, default=5
-        k-means++ starts for each K; the best after a few iterations goes on to convergence.
+        Starts for each K; the best after a few iterations goes on to convergence.
+    init_params : str, default="k-means++"
+        How they are made: ``"k-means++"``, samples far apart and their nearest; ``"kmeans"``, the
+        clusters of k-means; ``"random_from_data"``, samples at random and their nearest;
+        ``"random"``, shares of all samples at random.
     tol : float, default=1e-5
         Stop when the mean log-likelihood of a sample rises by less.
     max_iter : int, default=1000
         Bound on the iterations of one fit.
     covariance_floor : float, default=1e-6
         Added to the diagonal of each covariance, as a share of each column's variance.
+    reg_covar : float, optional
+        Added to the diagonal of each covariance instead, in the data's own units squared.
     weights_init : array-like, shape (K,), optional
     means_init : array-like, shape (K, d), optional
     precisions_init : array-like, shape (K, d, d), optional
-        A start to use instead of k-means++: all three or none, with `n_components` given.
+        Parts of a start, in place of what `init_params` makes of them; together, all of it. They
+        say what K is where `n_components` does not.
     start : GaussianMixture, optional
         A fitted mixture of the same columns to refit from, say of the trials before the last. Its
         number of components K is begun there alone, and a scan tries only K − 1, K and K + 1.
     n_jobs : int or None, default=None
         Threads. None takes one for each core, but a single one in a worker process. The result is
         the same to the last bit whatever their number.
-    random_state : int, numpy.random.Generator or None
+    warm_start : bool, default=False
+        Whether a second `fit` begins where the first ended, as with `start`.
+    random_state : int, numpy.random.Generator, numpy.random.RandomState or None
         Source of the starts.
+    verbose, verbose_interval : int, default=0 and 10
+        Only there because scikit-learn has them: the compiled loops say nothing on the way, and
+        `bics_` and `n_iter_` tell afterwards. Anything but the defaults is refused.
 
     Attributes
     ----------
     weights_ : ndarray, shape (K,)
     means_ : ndarray, shape (K, d)
     covariances_ : ndarray, shape (K, d, d)
+    precisions_ : ndarray, shape (K, d, d)
+        Their inverses.
+    precisions_cholesky_ : ndarray, shape (K, d, d)
+        Upper triangles U of U Uᵀ = the precisions.
     n_components_ : int
     lower_bound_ : float
         Mean log-likelihood of a sample.
     bics_ : dict of int to float
         The BIC of every K that was tried.
+    scan_ended_at_largest_ : bool
+        Whether the least BIC is that of the largest of several K that were tried: more components
+        might do better, and `max_components`, or the number of samples, was in the way.
     converged_ : bool
     n_iter_ : int
     n_features_in_ : int
@@ -109,29 +134,41 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         n_components: int | None = None,
         *,
         max_components: int = 10,
+        covariance_type: str = "full",
         n_init: int = 5,
+        init_params: str = "k-means++",
         tol: float = 1e-5,
         max_iter: int = 1000,
         covariance_floor: float = 1e-6,
+        reg_covar: float | None = None,
         weights_init: ArrayLike | None = None,
         means_init: ArrayLike | None = None,
         precisions_init: ArrayLike | None = None,
         start: "GaussianMixture | None" = None,
         n_jobs: int | None = None,
-        random_state: int | np.random.Generator | None = None,
+        warm_start: bool = False,
+        random_state: RandomState = None,
+        verbose: int = 0,
+        verbose_interval: int = 10,
     ) -> None:
         self.n_components = n_components
         self.max_components = max_components
+        self.covariance_type = covariance_type
         self.n_init = n_init
+        self.init_params = init_params
         self.tol = tol
         self.max_iter = max_iter
         self.covariance_floor = covariance_floor
+        self.reg_covar = reg_covar
         self.weights_init = weights_init
         self.means_init = means_init
         self.precisions_init = precisions_init
         self.start = start
         self.n_jobs = n_jobs
+        self.warm_start = warm_start
         self.random_state = random_state
+        self.verbose = verbose
+        self.verbose_interval = verbose_interval
 
     @classmethod
     def from_parameters(
@@ -195,13 +232,13 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         used = weight > 0
         if not np.all(used):
             samples, weight = samples[used], weight[used]
-        # The order of the samples matters to k-means++ alone.
-        if self.means_init is None:
+        # The order of the samples matters to what makes a start of them alone.
+        if not self._start_is_whole():
             samples, weight = starts.sort_samples(samples, weight)
         Z, offset, scale = _standardise(samples, weight)
         blocks = em.in_blocks(Z, weight)
         candidates = self._candidates(Z, weight, blocks, offset, scale)
-        fits = fitting.fit_each(blocks, candidates, self._rule(), self._threads())
+        fits = fitting.fit_each(blocks, candidates, self._rule(scale), self._threads())
         self._keep_best(fits, float(weight.sum()), size, offset, scale)
         return self
 
@@ -228,7 +265,7 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         """
         if n_subsample < 2:
             raise MisstepError(f"n_subsample must be at least 2, got {n_subsample}")
-        found = survey(chunks, n_subsample, np.random.default_rng(self.random_state))
+        found = survey(chunks, n_subsample, generator_of(self.random_state))
         self.n_features_in_ = len(found.mean)
         self._check_settings()
         _check_spread(found.subsample[0], np.abs(found.subsample).max(axis=0), found.scale)
@@ -237,8 +274,8 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         Z = (samples - offset) / scale
         blocks = em.in_blocks(Z, weight)
         candidates = self._candidates(Z, weight, blocks, offset, scale)
-        threads, rule = self._threads(), self._rule()
-        if self.means_init is None:
+        threads, rule = self._threads(), self._rule(scale)
+        if not self._start_is_whole():
             begun = fitting.fit_each(blocks, candidates, rule, threads)
             mixtures = {K: fit.mixture for K, fit in begun.items()}
         else:
@@ -249,6 +286,12 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         )
         self._keep_best(dict(zip(mixtures, fits, strict=True)), n, n, offset, scale)
         return self
+
+    def fit_predict(
+        self, X: ArrayLike, y: object = None, sample_weight: ArrayLike | None = None
+    ) -> NDArray[np.intp]:
+        """Fit the mixture, and return the most responsible component of each sample, shape (N,)."""
+        return self.fit(X, y, sample_weight).predict(X)
 
     def score_samples(self, X: ArrayLike) -> Array:
         """Return the log density of each sample, shape (N,)."""
@@ -283,15 +326,25 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         mean = float(np.average(log_density, weights=weight))
         return bic_of(mean, effective_size(weight), *self.means_.shape)
 
+    def aic(self, X: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
+        """Return Akaike's information criterion on X (lower is better)."""
+        log_density = self.score_samples(X)
+        weight = _checked_weight(sample_weight, log_density)
+        mean = float(np.average(log_density, weights=weight))
+        return 2.0 * self._n_parameters() - 2.0 * effective_size(weight) * mean
+
+    def _n_parameters(self) -> int:
+        return n_parameters(*self.means_.shape)
+
     def sample(
-        self, n_samples: int = 1, random_state: int | np.random.Generator | None = None
+        self, n_samples: int = 1, random_state: RandomState = None
     ) -> tuple[Array, NDArray[np.intp]]:
         """Draw samples.
 
         Parameters
         ----------
         n_samples : int
-        random_state : int, numpy.random.Generator or None
+        random_state : int, numpy.random.Generator, numpy.random.RandomState or None
             None draws from the estimator's own `random_state`.
 
         Returns
@@ -303,7 +356,7 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         check_is_fitted(self)
         if n_samples < 1:
             raise MisstepError(f"n_samples must be at least 1, got {n_samples}")
-        rng = np.random.default_rng(self.random_state if random_state is None else random_state)
+        rng = generator_of(self.random_state if random_state is None else random_state)
         labels = rng.choice(len(self.weights_), size=n_samples, p=self.weights_)
         noise = rng.standard_normal((n_samples, self.means_.shape[1]))
         lower = np.linalg.cholesky(self.covariances_)
@@ -318,6 +371,11 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         ----------
         indices : sequence of int, length n
         x : array-like, shape (n,)
+
+        Raises
+        ------
+        MisstepError
+            If they are not some, and not all, of the columns, or `x` is no such state.
         """
         check_is_fitted(self)
         return Conditioner(self, indices).at(x)
@@ -344,6 +402,7 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         return ellipses
 
     def _check_settings(self) -> None:
+        self._check_words()
         bounds = {"n_components": 1, "max_components": 1, "n_init": 1, "max_iter": 0, "n_jobs": 1}
         optional = {"n_components", "n_jobs"}
         for name, least in bounds.items():
@@ -352,40 +411,78 @@ class GaussianMixture(DensityMixin, BaseEstimator):
                 continue
             if not isinstance(value, int | np.integer) or value < least:
                 raise MisstepError(f"{name} must be a whole number ≥ {least}, got {value!r}")
-        for name in ("tol", "covariance_floor"):
+        for name in ("tol", "covariance_floor", "reg_covar"):
             value = getattr(self, name)
+            if value is None and name == "reg_covar":
+                continue
             if not isinstance(value, int | float | np.number) or not 0 <= value < math.inf:
                 raise MisstepError(f"{name} must be ≥ 0 and finite, got {value!r}")
-        given = [v is not None for v in (self.weights_init, self.means_init, self.precisions_init)]
-        if any(given) and not (all(given) and self.n_components is not None):
-            raise MisstepError(
-                "a start needs weights_init, means_init, precisions_init and n_components together"
-            )
+        given = self._given()
         if self.start is not None:
             check_is_fitted(self.start)
-            if self.start.means_.shape[1] != self.n_features_in_ or any(given):
+            if self.start.means_.shape[1] != self.n_features_in_ or given:
                 raise MisstepError(
                     f"start has {self.start.means_.shape[1]} columns and the samples "
                     f"{self.n_features_in_}: refit a mixture of the same columns, without "
                     f"weights_init, means_init and precisions_init"
                 )
 
+    def _check_words(self) -> None:
+        """Refuse what scikit-learn's mixture can be told and this one cannot."""
+        if self.covariance_type != "full":
+            raise MisstepError(
+                f"covariance_type is {self.covariance_type!r}: it is 'full', because conditioning "
+                "on a state needs every covariance"
+            )
+        if self.init_params not in starts.MAKERS:
+            raise MisstepError(
+                f"init_params is {self.init_params!r}; there are: {', '.join(starts.MAKERS)}"
+            )
+        if self.verbose or self.verbose_interval != 10:
+            raise MisstepError(
+                "verbose cannot be set: the compiled loops say nothing on the way; bics_ and "
+                "n_iter_ tell afterwards"
+            )
+
+    def _given(self) -> dict[str, Array]:
+        """Return the parts of a start that are given, as arrays."""
+        names = ("weights_init", "means_init", "precisions_init")
+        parts = {name: getattr(self, name) for name in names}
+        return {n: _numbers(part, n) for n, part in parts.items() if part is not None}
+
+    def _start_is_whole(self) -> bool:
+        return len(self._given()) == 3
+
+    def _before(self) -> "GaussianMixture | None":
+        """Return the mixture to refit from, if there is one."""
+        begun = self.warm_start and hasattr(self, "weights_")
+        if self.start is None and begun and self.means_.shape[1] == self.n_features_in_:
+            own = self.weights_, self.means_, self.covariances_
+            return GaussianMixture.from_parameters(*own)
+        return self.start
+
     def _range(self, n_samples: int, d: int) -> range:
-        if self.n_components is not None:
-            if self.n_components > n_samples:
+        given = {len(part) for part in self._given().values() if part.ndim}
+        K = self.n_components if self.n_components is not None else next(iter(given), None)
+        if K is not None:
+            if n_samples < K:
                 raise MisstepError(
-                    f"n_components={self.n_components} but there are only {n_samples} distinct "
-                    f"samples: K can be at most their number"
+                    f"n_components={K} but there are only {n_samples} distinct samples: K can be "
+                    "at most their number"
                 )
-            return range(self.n_components, self.n_components + 1)
+            return range(K, K + 1)
         most = max(1, min(self.max_components, n_samples // (d + 1)))
-        if self.start is None:
+        before = self._before()
+        if before is None:
             return range(1, most + 1)
-        K = min(self.start.n_components_, most)
+        K = min(before.n_components_, most)
         return range(max(1, K - 1), min(K + 1, most) + 1)
 
-    def _rule(self) -> Rule:
-        return Rule(float(self.covariance_floor), float(self.tol), int(self.max_iter))
+    def _rule(self, scale: Array) -> Rule:
+        floor = np.full(len(scale), float(self.covariance_floor))
+        if self.reg_covar is not None:
+            floor = float(self.reg_covar) / scale**2
+        return Rule(floor, float(self.tol), int(self.max_iter))
 
     def _threads(self) -> int:
         return fitting.available_threads() if self.n_jobs is None else self.n_jobs
@@ -395,22 +492,24 @@ class GaussianMixture(DensityMixin, BaseEstimator):
     ) -> dict[int, list[fitting.Start]]:
         """Return for each K the starts to choose from, given sorted standardised samples (N, d)."""
         K_range = self._range(*Z.shape)
-        if self.means_init is not None:
-            return {K: [partial(self._given_start, K, offset, scale)] for K in K_range}
-        spread = starts.spread_of(Z, weight, float(self.covariance_floor))
+        if self._start_is_whole():
+            return {K: [partial(self._given_start, None, K, offset, scale)] for K in K_range}
+        spread = starts.spread_of(Z, weight, self._rule(scale).floor)
+        make = starts.MAKERS[self.init_params]
+        before, given = self._before(), self._given()
 
-        def start(draws: Array) -> Mixture:
-            labels = starts.kmeans_plus_plus(samples, len(Z), draws)
-            return starts.moments_of(samples, len(Z), labels, len(draws), spread)
+        def start(K: int, child: np.random.Generator) -> Mixture:
+            made = make(samples, Z, weight, K, child, spread)
+            return self._given_start(made, K, offset, scale) if given else made
 
         candidates: dict[int, list[fitting.Start]] = {}
-        rng = np.random.default_rng(self.random_state)
+        rng = generator_of(self.random_state)
         for K in K_range:
             # Every start draws the same numbers whatever happens to the others.
             children = rng.spawn(self.n_init if K > 1 else 1)
-            candidates[K] = [partial(start, child.random(K)) for child in children]
-            if self.start is not None and self.start.n_components_ == K:
-                candidates[K] = [partial(_standardised, self.start, offset, scale)]
+            candidates[K] = [partial(start, K, child) for child in children]
+            if before is not None and before.n_components_ == K:
+                candidates[K] = [partial(_standardised, before, offset, scale)]
         return candidates
 
     def _keep_best(
@@ -430,6 +529,7 @@ class GaussianMixture(DensityMixin, BaseEstimator):
             bounds[K] = fits[K].log_likelihood / total - shift
             self.bics_[K] = bic_of(bounds[K], size, K, len(scale))
         K = min(self.bics_, key=self.bics_.__getitem__)
+        self.scan_ended_at_largest_ = len(self.bics_) > 1 and max(self.bics_) == K
         _, self.n_iter_, self.converged_, (weights, means, covariances) = fits[K]
         self.lower_bound_ = bounds[K]
         if not self.converged_:
@@ -441,26 +541,34 @@ class GaussianMixture(DensityMixin, BaseEstimator):
             )
         self._set_parameters(weights, means * scale + offset, covariances * np.outer(scale, scale))
 
-    def _given_start(self, K: int, offset: Array, scale: Array) -> Mixture:
-        weights = np.array(self.weights_init, dtype=np.float64)
-        means = (np.array(self.means_init, dtype=np.float64) - offset) / scale
-        precisions = np.array(self.precisions_init, dtype=np.float64, order="C")
-        d = len(offset)
-        if weights.shape != (K,) or means.shape != (K, d) or precisions.shape != (K, d, d):
-            raise MisstepError(
-                f"a start of {K} components in {d} columns has weights ({K},), means ({K}, {d}) "
-                f"and precisions ({K}, {d}, {d}), got {weights.shape}, {means.shape} and "
-                f"{precisions.shape}"
-            )
-        if not np.all(weights > 0) or not np.isfinite(weights.sum()):
-            raise MisstepError(f"weights_init must be positive and finite, got {weights.tolist()}")
-        if not np.all(np.isfinite(means)):
-            raise MisstepError("means_init must be finite")
-        whiteners = whiteners_of(precisions * np.outer(scale, scale))
-        if whiteners is None:
-            raise MisstepError("precisions_init must be symmetric positive definite")
-        covariances = whiteners.transpose(0, 2, 1) @ whiteners
-        return Mixture(weights / weights.sum(), means, covariances)
+    def _given_start(self, made: Mixture | None, K: int, offset: Array, scale: Array) -> Mixture:
+        """Return a start of given parts, and of what was made where a part is not given."""
+        given, d = self._given(), len(offset)
+        shapes = {"weights_init": (K,), "means_init": (K, d), "precisions_init": (K, d, d)}
+        for name, part in given.items():
+            if part.shape != shapes[name]:
+                raise MisstepError(
+                    f"{name} has shape {part.shape}, but {K} components in {d} columns take "
+                    f"{shapes[name]}"
+                )
+        weights, means, covariances = made or (np.empty(K), np.empty((K, d)), np.empty((K, d, d)))
+        if "weights_init" in given:
+            weights = given["weights_init"]
+            if not np.all(weights > 0) or not np.isfinite(weights.sum()):
+                raise MisstepError(
+                    f"weights_init must be positive and finite, got {weights.tolist()}"
+                )
+            weights = weights / weights.sum()
+        if "means_init" in given:
+            means = (given["means_init"] - offset) / scale
+            if not np.all(np.isfinite(means)):
+                raise MisstepError("means_init must be finite")
+        if "precisions_init" in given:
+            whiteners = whiteners_of(given["precisions_init"] * np.outer(scale, scale))
+            if whiteners is None:
+                raise MisstepError("precisions_init must be symmetric positive definite")
+            covariances = whiteners.transpose(0, 2, 1) @ whiteners
+        return Mixture(weights, means, covariances)
 
     def _set_parameters(self, weights: Array, means: Array, covariances: Array) -> None:
         if whiteners_of(covariances) is None:
@@ -474,6 +582,8 @@ class GaussianMixture(DensityMixin, BaseEstimator):
         self.weights_, self.means_, self.covariances_ = weights, means, covariances
         self.n_components_ = K
         self._whiteners, self._constants = whiteners, constants
+        self.precisions_cholesky_ = np.ascontiguousarray(whiteners.transpose(0, 2, 1))
+        self.precisions_ = self.precisions_cholesky_ @ whiteners
 
     def _log_joint(self, X: ArrayLike) -> Array:
         check_is_fitted(self)
@@ -500,16 +610,39 @@ def effective_size(sample_weight: Array) -> float:
 
 def bic_of(mean_log_likelihood: float, size: float, K: int, d: int) -> float:
     """BIC of a K-component mixture in d dimensions on `size` effective samples."""
-    n_parameters = K * (1 + d + d * (d + 1) // 2) - 1
-    return -2.0 * size * mean_log_likelihood + n_parameters * math.log(size)
+    return -2.0 * size * mean_log_likelihood + n_parameters(K, d) * math.log(size)
 
 
-def checked_columns(indices: Sequence[int], d: int) -> list[int]:
-    """Return `indices` as a list; raise MisstepError unless they are distinct columns of d."""
-    columns = [int(i) for i in indices]
-    if not columns or len(set(columns)) < len(columns) or not all(0 <= i < d for i in columns):
-        raise MisstepError(f"columns must be distinct numbers from 0 to {d - 1}, got {columns}")
-    return columns
+def n_parameters(K: int, d: int) -> int:
+    """Free parameters of a K-component mixture in d dimensions."""
+    return K * (1 + d + d * (d + 1) // 2) - 1
+
+
+def generator_of(random_state: RandomState) -> np.random.Generator:
+    """Return a generator that can be split into independent ones.
+
+    Raises
+    ------
+    MisstepError
+        If it is no seed and no generator.
+    """
+    if isinstance(random_state, np.random.RandomState):
+        # Its state cannot be split, but draws a seed like any other number.
+        return np.random.default_rng(random_state.randint(2**32, size=4, dtype=np.uint64))
+    try:
+        return np.random.default_rng(random_state)
+    except (TypeError, ValueError) as error:
+        raise MisstepError(
+            f"random_state is {random_state!r}: it is a whole number from 0 on, a Generator or "
+            "RandomState of NumPy's, or None"
+        ) from error
+
+
+def _numbers(values: object, name: str) -> Array:
+    try:
+        return np.array(values, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise MisstepError(f"{name} has to be an array of numbers") from error
 
 
 def _standardised(model: GaussianMixture, offset: Array, scale: Array) -> Mixture:

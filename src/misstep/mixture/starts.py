@@ -7,6 +7,8 @@ needs.
 """
 
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,11 +33,75 @@ def sort_samples(X: Array, sample_weight: Array) -> tuple[Array, Array]:
     return X[first], np.add.reduceat(sample_weight, first)
 
 
-def spread_of(X: Array, sample_weight: Array, floor: float) -> Array:
+def spread_of(X: Array, sample_weight: Array, floor: Array) -> Array:
     """Return the covariance (d, d) of all samples, with the floor."""
     d = X.shape[1]
     covariance: Array = np.cov(X.T, aweights=sample_weight, ddof=0).reshape(d, d)
-    return covariance + floor * np.eye(d)
+    return covariance + np.diag(floor)
+
+
+Maker = Callable[[Samples, Array, Array, int, np.random.Generator, Array], Mixture]
+"""Makes a start of K components: of samples in blocks and as sorted rows (N, d), their weights, K,
+a generator, and the covariance of all samples."""
+
+
+def from_kmeans_plus_plus(
+    samples: Samples, Z: Array, weight: Array, K: int, rng: np.random.Generator, spread: Array
+) -> Mixture:
+    """Draw seeds far apart, and take the samples nearest to each."""
+    labels = kmeans_plus_plus(samples, len(Z), rng.random(K))
+    return moments_of(samples, len(Z), labels, K, spread)
+
+
+def from_kmeans(
+    samples: Samples, Z: Array, weight: Array, K: int, rng: np.random.Generator, spread: Array
+) -> Mixture:
+    """Take the clusters of scikit-learn's k-means."""
+    from sklearn.cluster import KMeans  # slow to import
+
+    seed = int(rng.integers(2**31))
+    clusters = KMeans(K, n_init=1, random_state=seed).fit(Z, sample_weight=weight)
+    return moments_of(samples, len(Z), _blocks_of(samples, clusters.labels_), K, spread)
+
+
+def from_random_samples(
+    samples: Samples, Z: Array, weight: Array, K: int, rng: np.random.Generator, spread: Array
+) -> Mixture:
+    """Draw samples at random, and take those nearest to each."""
+    seeds = Z[rng.choice(len(Z), size=K, replace=False, p=weight / weight.sum())]
+    nearest = np.argmin([((Z - seed) ** 2).sum(axis=1) for seed in seeds], axis=0)
+    return moments_of(samples, len(Z), _blocks_of(samples, nearest), K, spread)
+
+
+def from_random_shares(
+    samples: Samples, Z: Array, weight: Array, K: int, rng: np.random.Generator, spread: Array
+) -> Mixture:
+    """Draw shares of all samples at random: every component begins near the middle."""
+    shares = rng.random((len(Z), K))
+    shares *= (weight / shares.sum(axis=1))[:, None]
+    mass = shares.sum(axis=0)
+    means = shares.T @ Z / mass[:, None]
+    covariances = np.stack(
+        [np.cov(Z.T, aweights=share, ddof=0).reshape(spread.shape) for share in shares.T]
+    )
+    floor = 1e-6 * np.eye(len(spread))  # two equal samples have no spread
+    return Mixture(mass / mass.sum(), means, covariances + floor)
+
+
+MAKERS: dict[str, Maker] = {
+    "k-means++": from_kmeans_plus_plus,
+    "kmeans": from_kmeans,
+    "random_from_data": from_random_samples,
+    "random": from_random_shares,
+}
+"""By the names that scikit-learn gives them."""
+
+
+def _blocks_of(samples: Samples, labels: NDArray[np.integer]) -> Labels:
+    """Return labels of rows (N,) as labels of blocks; padding has no weight and label 0."""
+    blocks = np.zeros(samples.weight.shape, np.int32)
+    blocks.ravel()[: len(labels)] = labels
+    return blocks
 
 
 def kmeans_plus_plus(samples: Samples, n_samples: int, draws: Array) -> Labels:

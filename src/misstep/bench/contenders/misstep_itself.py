@@ -38,7 +38,7 @@ def fit_all(X: Any, starts: list[Any], n: int) -> list[tuple[Any, float]]:
 
     offset, scale = X.mean(axis=0), X.std(axis=0)
     samples = em.in_blocks((X - offset) / scale, np.ones(len(X)))
-    rule, candidates = em.Rule(0.0, 0.0, n), {}
+    rule, candidates = em.Rule(np.zeros(len(scale)), 0.0, n), {}
     for weights, means, covariances in starts:
         start = em.Mixture(weights, (means - offset) / scale, covariances / np.outer(scale, scale))
         candidates[len(weights)] = [lambda start=start: start]
