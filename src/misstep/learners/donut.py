@@ -137,30 +137,34 @@ class DonutPolicy(MixturePolicy):
     ) -> None:
         super().__init__(task, mixture)
         k, reach, _, formula = settings
-        self._query = DonutQuery(self.conditioner, scale, k, reach, formula)
+        low, high = task.action_low, task.action_high
+        columns = self._indices
+        self._query = DonutQuery(self.conditioner, scale, k, reach, formula, low, high, columns)
         self.scale = scale
         self.settings = settings
+        self._on_density = settings.climb == "density"
         self.reset()
 
     def reset(self) -> None:
         """Forget the previous action: the first climb starts from the best candidate."""
         self._action = np.zeros(len(self.scale))
-        self._first = True
+        self._is_warm = False
         self.exploration = 0.0
 
     def __call__(self, observation: Array, /) -> Array:
         """Return the mode, clipped; the next climb starts from there."""
-        climb = self.settings.climb
-        state = self.state_of(observation)
-        warm = climb != "global" and not self._first
-        self.exploration = self._query.explore(state, self._action, warm, climb == "density")
-        self._first = False
-        possible = self.clipped(self._action)
-        if not warm and not np.array_equal(possible, self._action):
-            # Clipped it would be no mode, and every trial after it the same.
-            possible = self.clipped(self._possible_mode(state))
-        self._action = possible
-        return self._action.copy()
+        action, warm = self._action, self._is_warm
+        self.exploration = self._query.explore(observation, action, warm, self._on_density)
+        if not warm:
+            self._is_warm = self.settings.climb != "global"
+            if self._is_at_a_bound(action):
+                # Moved there it is no mode, and every trial after it would be the same.
+                action[:] = self.clipped(self._possible_mode(self.state_of(observation)))
+        return action.copy()
+
+    def _is_at_a_bound(self, action: Array) -> bool:
+        low, high = self.task.action_low, self.task.action_high
+        return bool(((action <= low) | (action >= high)).any())
 
     def _possible_mode(self, state: Array) -> Array:
         """Return the mode above the best analytic candidate that the actuators can do, (m,)."""

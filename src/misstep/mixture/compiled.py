@@ -404,6 +404,13 @@ def _trust_step(gradient, metric, hessian, norm, radius, step, shifted, lower, i
     `norm` is the gradient's, in the inverse metric.
     """
     d = gradient.shape[0]
+    if d == 1:  # the same in closed form
+        deviation, bend = 1.0 / math.sqrt(metric[0, 0]), hessian[0, 0]
+        length = radius
+        if bend < 0.0:
+            length = min(radius, -norm / (bend * deviation * deviation))
+        step[0] = math.copysign(length * deviation, gradient[0])
+        return step[0] * (gradient[0] + 0.5 * step[0] * bend), length
     shift, least, most, length = 0.0, 0.0, np.inf, -1.0
     for _ in range(MOST_SHIFTS):
         for i in range(d):
@@ -703,60 +710,100 @@ def donut_shape(exploration, d, k, reach):
     return (gamma, r_alpha, r_beta), ridge
 
 
-@njit(**COMPILED)
-def answer(
-    state,
-    action,
-    warm,
-    flat_stays,
-    printed,
-    k,
-    reach,
-    scale,
-    state_constants,
-    state_means,
-    state_whiteners,
-    gains,
-    action_means,
-    covariances,
-    whiteners,
-    precisions,
-    lowers,
-    log_norms,
-    scratch,
-):
-    """Condition on `state`, choose ε, climb the donut mixture; overwrite `action`, return ε.
+# What comes first in the array of a query: n, d, K, whether the formula is as printed, k and reach.
+HEAD = 6
 
-    With `warm` the climb starts from the `action` that comes in, otherwise from the best analytic
-    candidate. With `flat_stays` the action climbs the density itself, as in the paper's listing: it
-    stays where that is zero in double precision, and never jumps to another hill. `printed` takes
-    ε = 1/(1 + V/s²), the paper's formula as printed.
+
+def packed_query(columns, state_arrays, component_arrays, scale, bounds, family):
+    """Return one array of all that `answer` needs: to hand over twenty takes longer than to answer.
+
+    Parameters
+    ----------
+    columns : ndarray of int, shape (n,)
+        Of an observation, that are the state.
+    state_arrays : tuple
+        Of a `Conditioner`: state_constants (K,), state_means (K, n), state_whiteners (K, n, n),
+        gains (K, d, n), action_means (K, d), covariances (K, d, d).
+    component_arrays : tuple
+        Whiteners, precisions, lower factors (K, d, d) and log norms (K,) of those covariances.
+    scale : ndarray, shape (d,)
+    bounds : ndarray, shape (2, d)
+    family : tuple
+        Whether the formula is as printed, k and reach.
     """
-    n_components, d = action_means.shape
+    K, n = state_arrays[1].shape
+    d = len(scale)
+    head = np.array([n, d, K, *family], dtype=np.float64)
+    rest = scale, bounds, columns, np.empty(n), scratch_for(K, d)
+    arrays = head, *state_arrays, *component_arrays, *rest
+    return np.concatenate([np.ravel(array) for array in arrays])
+
+
+@njit(**COMPILED)
+def answer(observation, action, warm, flat_stays, packed):
+    """Condition on an observed state, choose ε, climb; overwrite `action` and return ε.
+
+    The action is a mode, moved inside the bounds. With `warm` the climb starts from the `action`
+    that comes in, otherwise from the best analytic candidate. With `flat_stays` the action climbs
+    the density itself, as in the paper's listing: it stays where that is zero in double precision,
+    and never jumps to another hill. ``packed`` is of `packed_query`; its formula as printed takes
+    ε = 1/(1 + V/s²).
+    """
+    n, d, n_components = int(packed[0]), int(packed[1]), int(packed[2])
+    at = HEAD
+    state_constants = packed[at : at + n_components]
+    at += n_components
+    state_means = packed[at : at + n_components * n].reshape((n_components, n))
+    at += n_components * n
+    state_whiteners = packed[at : at + n_components * n * n].reshape((n_components, n, n))
+    at += n_components * n * n
+    gains = packed[at : at + n_components * d * n].reshape((n_components, d, n))
+    at += n_components * d * n
+    action_means = packed[at : at + n_components * d].reshape((n_components, d))
+    at += n_components * d
+    size = n_components * d * d
+    covariances = packed[at : at + size].reshape((n_components, d, d))
+    whiteners = packed[at + size : at + 2 * size].reshape((n_components, d, d))
+    precisions = packed[at + 2 * size : at + 3 * size].reshape((n_components, d, d))
+    lowers = packed[at + 3 * size : at + 4 * size].reshape((n_components, d, d))
+    at += 4 * size
+    log_norms = packed[at : at + n_components]
+    at += n_components
+    scale = packed[at : at + d]
+    low, high = packed[at + d : at + 2 * d], packed[at + 2 * d : at + 3 * d]
+    at += 3 * d
+    state = packed[at + n : at + 2 * n]
+    for i in range(n):
+        state[i] = observation[int(packed[at + i])]
+    scratch = packed[at + 2 * n :]
+
     h, _, _, _, m, _ = _component_rooms(scratch, n_components, d)
     condition(state, state_constants, state_means, state_whiteners, gains, action_means, h, m)
     spread = scaled_variance(h, m, covariances, scale)
-    exploration = exploration_of(spread, printed)
-    shape, ridge = donut_shape(exploration, d, k, reach)
-    for i in range(n_components):
-        h[i] = math.log(h[i]) if h[i] > 0.0 else -np.inf
+    exploration = exploration_of(spread, packed[3] == 1.0)
+    shape, ridge = donut_shape(exploration, d, packed[4], packed[5])
+    for k in range(n_components):
+        h[k] = math.log(h[k]) if h[k] > 0.0 else -np.inf
+    stays = False
     if warm and flat_stays:
         gradient = _vector_room(scratch, n_components, d, 1)
         value = mixture_density(action, h, m, whiteners, log_norms, shape, gradient, scratch)
-        if math.exp(value) == 0.0:
-            return exploration
-    climb(
-        action,
-        h,
-        m,
-        whiteners,
-        precisions,
-        lowers,
-        log_norms,
-        shape,
-        ridge,
-        warm,
-        not flat_stays,
-        scratch,
-    )
+        stays = math.exp(value) == 0.0
+    if not stays:
+        climb(
+            action,
+            h,
+            m,
+            whiteners,
+            precisions,
+            lowers,
+            log_norms,
+            shape,
+            ridge,
+            warm,
+            not flat_stays,
+            scratch,
+        )
+    for i in range(d):
+        action[i] = min(max(action[i], low[i]), high[i])
     return exploration

@@ -28,6 +28,10 @@ class DonutQuery:
         The donut family, see `DonutShape.of`.
     formula : {"prose", "printed"}
         See `exploration_from_variance`.
+    low, high : array-like, shape (d,), optional
+        Bounds of the actions; infinite if left out.
+    columns : sequence of n int, optional
+        Where the state's columns are in what is handed to `explore`; the first n if left out.
 
     Raises
     ------
@@ -42,46 +46,53 @@ class DonutQuery:
         k: float = DEFAULT_K,
         reach: float = DEFAULT_REACH,
         formula: str = "prose",
+        low: ArrayLike | None = None,
+        high: ArrayLike | None = None,
+        columns: ArrayLike | None = None,
     ) -> None:
         c = conditioner
-        K, d = c.action_means.shape
+        d = c.action_means.shape[1]
         self._n, self._d = c.state_means.shape[1], d
         check_family(k, reach)
         check_hole(k, d)
         s = np.array(scale, dtype=np.float64)
         check_scale(s, d)
         check_formula(formula)
-        self._family = (formula == "printed", float(k), float(reach), s)
-        self._arrays = (
+        bounds = np.empty((2, d))
+        bounds[0] = -np.inf if low is None else low
+        bounds[1] = np.inf if high is None else high
+        state_arrays = (
             c.state_constants,
             c.state_means,
             c.state_whiteners,
             c.gains,
             c.action_means,
             c.covariances,
-            *component_arrays(c.covariances),
-            compiled.scratch_for(K, d),
         )
+        family = (float(formula == "printed"), float(k), float(reach))
+        components = component_arrays(c.covariances)
+        at = np.arange(self._n) if columns is None else columns
+        self._packed = compiled.packed_query(at, state_arrays, components, s, bounds, family)
 
     def explore(self, state: Array, action: Array, warm: bool, flat_stays: bool = False) -> float:
-        """Overwrite `action` with a mode at `state` and return ε; nothing is checked or allocated.
+        """Overwrite `action` with a mode at `state`, inside the bounds, and return ε.
+
+        Nothing is checked or allocated.
 
         Parameters
         ----------
-        state : ndarray of float64, shape (n,)
+        state : ndarray of float64, shape (n,), or an observation with those columns in it
         action : ndarray of float64, shape (d,)
         warm : bool
             Climb from the `action` that comes in; otherwise from the best analytic candidate.
         flat_stays : bool
             Whether an action stays where its density is zero in double precision.
         """
-        exploration: float = compiled.answer(
-            state, action, warm, flat_stays, *self._family, *self._arrays
-        )
+        exploration: float = compiled.answer(state, action, warm, flat_stays, self._packed)
         return exploration
 
     def modes(self, states: ArrayLike) -> tuple[Array, Array]:
-        """Return the modes (N, d) and ε (N,) at states (N, n), each from its best candidate.
+        """Return the modes (N, d), inside the bounds, and ε (N,) at states (N, n), begun cold.
 
         Raises
         ------

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+LEVEL = 1e-9
+"""A step that gains no more log density is the last, as in `misstep.mixture.compiled`."""
 STOP = 1e-7
-"""In standard deviations, as `misstep.mixture.compiled`."""
 LONGEST = 0.5
 WIDTH = 1e-3
 MOST_STEPS = 100
@@ -64,6 +65,8 @@ def climb(density: Callable[[Any], Any], action: Any, deviation: Any) -> Any:
                 bend[i, j] = bend[j, i] = top - forward[i] - forward[j] + value
             curvature, axes = np.linalg.eigh(bend / WIDTH**2)
             step = axes @ (axes.T @ slope / np.maximum(np.abs(curvature), 1e-3))
+            if 0.5 * slope @ step < LEVEL:
+                return action + step * deviation
             step *= min(1.0, LONGEST / max(math.sqrt(step @ step), 1e-300))
         if math.sqrt(step @ step) < STOP:
             break
