@@ -127,10 +127,10 @@ def _queries(rows: Sequence[Row]) -> Table:
         "Which action now?",
         "Condition the mixture on one state, choose ε, and climb to the mode of the donut mixture "
         "from the previous action, along a path of states, up to the step that would gain less "
-        "than 1e-9 of log density. The others stop at densities: over theirs climbs a Newton ascent "
-        "in NumPy, a handful of calls a state, to the same end. “agree” is the share of modes within "
-        "5 % of a standard deviation of misstep's; ascents that took different sides of a ridge once "
-        "stay there.",
+        "than 1e-9 of log density. The others stop at densities: over theirs climbs a Newton "
+        "ascent in NumPy, a handful of calls a state, to the same end. “agree” is the share of "
+        "modes within 5 % of a standard deviation of misstep's; ascents that took different sides "
+        "of a ridge once stay there.",
         ("d", "K", "contender", "median µs", "p99 µs", "× PyPR", "× gmr", "agree", "bare µs"),
         [
             (
