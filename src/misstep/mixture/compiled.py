@@ -329,7 +329,7 @@ def mixture_curvature(
     return density
 
 
-@njit(**COMPILED)
+@njit(**_INLINED)
 def _factor(matrix, lower):
     """Fill `lower` with L of L Lᵀ = `matrix`, of which the lower triangle is read.
 
@@ -350,7 +350,7 @@ def _factor(matrix, lower):
     return True
 
 
-@njit(**COMPILED)
+@njit(**_INLINED)
 def _forward(lower, right, out):
     """Fill `out` with L⁻¹ `right`; return its squared length."""
     squared = 0.0
@@ -363,7 +363,7 @@ def _forward(lower, right, out):
     return squared
 
 
-@njit(**COMPILED)
+@njit(**_INLINED)
 def _backward(lower, out):
     """Overwrite `out` with L⁻ᵀ `out`."""
     d = out.shape[0]
@@ -374,7 +374,7 @@ def _backward(lower, out):
         out[i] = s / lower[i, i]
 
 
-@njit(**COMPILED)
+@njit(**_INLINED)
 def _times(matrix, x, out):
     """Fill `out` with a symmetric matrix, of which the lower triangle is read, times x."""
     d = x.shape[0]
