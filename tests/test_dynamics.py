@@ -565,7 +565,7 @@ def test_a_cost_of_other_columns_is_refused(refused, cartpole, shown):
         ("model_centres", lambda a: a[:, 1:], "forward model's centres has shape"),
         ("model_constant", lambda a: a[:1], "forward model's local has shape"),
         ("model_source", lambda a: a + 100, "each integral needs a learned source"),
-        ("goal", lambda a: a[1:], "its cost"),
+        ("goal", lambda a: a[1:], "a cost has one goal, weight and limit for each column"),
         ("circles", lambda a: np.array([[0], [4]]), "two rows of distinct columns, from 0 to 3"),
         ("circles", lambda a: np.array([[1], [1]]), "two rows of distinct columns, from 0 to 3"),
         ("settings", lambda a: a * [0, 1], "horizon is 0 steps"),

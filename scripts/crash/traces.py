@@ -16,6 +16,7 @@ import numpy as np
 from PIL import Image
 
 from misstep import MisstepError, Trajectory, load_dataset
+from misstep.locks import LOCK
 from misstep.robot.log import read_log
 from misstep.study.table import TIMING
 
@@ -27,7 +28,7 @@ _TIMES = {*TIMING, "timing", "url", "command"}
 
 
 def trace(folder: Path) -> Trace:
-    """Return what a folder holds, temporary files left out.
+    """Return what a folder holds, temporary files and the name of who drives it left out.
 
     Raises
     ------
@@ -39,7 +40,7 @@ def trace(folder: Path) -> Trace:
         folders[:] = [name for name in folders if not _is_temporary(name)]
         for name in names:
             path = Path(parent, name)
-            if not _is_temporary(name):
+            if not _is_temporary(name) and name != LOCK:
                 found[str(path.relative_to(folder))] = _trace_file(path)
     return found
 

@@ -5,6 +5,7 @@
     options.py        options that several commands share, and how their texts are read
     output.py         JSON files, and what must not be written over
     table.py          tables on stdout
+    memory.py         whether what went wrong did so for want of memory
     progress.py       a progress bar on a terminal, lines elsewhere
     interruption.py   what to do after a Ctrl-C
     record.py         demonstrate
@@ -31,6 +32,7 @@ import sys
 from collections.abc import Sequence
 
 from misstep.cli.interruption import ending_at_once
+from misstep.cli.memory import OUT_OF_MEMORY, has_room
 
 __all__ = ["main"]
 
@@ -48,6 +50,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         The exit code.
     """
-    with ending_at_once():
-        from misstep.cli.app import run
+    try:
+        with ending_at_once():
+            from misstep.cli.app import run
+    except Exception:  # libraries that are refused memory raise anything
+        if has_room():
+            raise
+        print("misstep:", OUT_OF_MEMORY, file=sys.stderr)
+        return 2
     return run(list(sys.argv[1:] if arguments is None else arguments))

@@ -38,6 +38,7 @@ from misstep.cli import (
     study,
 )
 from misstep.cli.interruption import Terminated, interruptible
+from misstep.cli.memory import OUT_OF_MEMORY, has_room
 from misstep.cli.streams import forgiving_output
 from misstep.errors import MisstepError
 from misstep.version import __version__
@@ -57,9 +58,6 @@ class _Commands(TyperGroup):
 
 # The backspace keeps the help from breaking the line.
 _EXAMPLE = "\b\nExample:\n  {}"
-
-_ROOM = 2**26
-"""Bytes. What goes wrong where so many cannot be had goes wrong for want of memory."""
 
 # Plain help instead of boxes: it is there at once, and an example in it can be copied.
 app = typer.Typer(cls=_Commands, add_completion=False, rich_markup_mode=None)
@@ -143,23 +141,15 @@ def _explain(error: BaseException) -> tuple[str, int] | None:
     if isinstance(error, typer.TyperException):
         return f"error: {_usage(error)}", 2
     if isinstance(error, MisstepError):
-        return f"error: {'' if _has_room() else 'out of memory: '}{error}", 2
+        return f"error: {'' if has_room() else 'out of memory: '}{error}", 2
     if isinstance(error, UnicodeEncodeError):  # of a library that takes no bytes for a name
         return "error: a name is no text in UTF-8, as this format needs it: rename what it names", 2
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return f"error: cannot write: {error.strerror}; free some room", 2
     # Libraries that are refused memory raise anything: ImportError, OSError, SystemError ...
-    if isinstance(error, MemoryError) or not _has_room():
-        return "error: out of memory: free some, or give it less to do at a time", 2
+    if isinstance(error, MemoryError) or not has_room():
+        return OUT_OF_MEMORY, 2
     return None
-
-
-def _has_room() -> bool:
-    """Say whether the system still gives memory to this process."""
-    try:
-        return len(bytearray(_ROOM)) == _ROOM
-    except MemoryError:
-        return False
 
 
 def _drop_output() -> None:

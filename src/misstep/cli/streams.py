@@ -22,6 +22,8 @@ def forgiving_output() -> Iterator[None]:
     try:
         yield
     finally:
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
         sys.stdout, sys.stderr = before
 
 
@@ -45,8 +47,9 @@ def _forgiving(stream: Any, descriptor: int) -> Any:
     if not own:  # of a test, or of an editor
         return stream
     stream.flush()
+    output: Any = _Output(descriptor, "w", closefd=False)
     return io.TextIOWrapper(
-        io.BufferedWriter(_Output(descriptor, "w", closefd=False)),
+        output if stream.write_through else io.BufferedWriter(output),  # PYTHONUNBUFFERED
         encoding=stream.encoding,
         errors="replace",
         line_buffering=stream.line_buffering,
