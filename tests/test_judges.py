@@ -1,4 +1,5 @@
 import math
+import re
 
 import numpy as np
 import pytest
@@ -8,7 +9,9 @@ from hypothesis import strategies as st
 
 from misstep import Outcome, demonstrate, learn, load_run, make_system, rollout
 from misstep.errors import MisstepError
-from misstep.judges import DEEPEST, LONGEST, parse_cost, parse_predicate
+from misstep.formats.format import Episode
+from misstep.judges import DEEPEST, FLAGS, LONGEST, parse_cost, parse_predicate
+from misstep.recordings.outcomes import judged
 from misstep.systems import CartPole, Judged
 from misstep.trajectory import Column
 
@@ -187,8 +190,8 @@ def test_units_are_converted_where_they_meet(text, true, false):
         ("x.real > 1", r"no column 'x\.real'"),
         ("x ** 2 > 1", r"character 4: a value is missing before '\*'"),
         ("theta > 30grad", "'grad' is no unit; there are: m, cm"),
-        ("x > 3deg", "this is in deg and cannot be set against what is in m: 'x > .here. 3deg'"),
-        ("o0 > 3cm", "this is in cm and cannot be set against what is without a unit"),
+        ("x > 3deg", "this is in rad and cannot be set against what is in m: 'x > .here. 3deg'"),
+        ("o0 > 3cm", "this is in m and cannot be set against what is without a unit"),
         ("x > theta", "this is in rad and cannot be set against what is in m"),
         ("sin(x) > 0", "sin takes an angle, but this is in m"),
         ("abs(x, x) > 1", "abs takes one value, not 2"),
@@ -427,3 +430,84 @@ def test_an_episode_that_is_over_is_told():
 def test_wrong_judges_are_told_in_one_line(refused, judge, line):
     with refused(line):
         make_system("cartpole", **judge)
+
+
+# Units
+
+
+@pytest.mark.parametrize(
+    ("text", "row", "expected"),
+    [
+        ("sqrt(x*x + y*y) > 1m", [2.0, 0.0, 0.0, 0.0], False),  # mm
+        ("sqrt(x*x + y*y) > 1m", [999.0, 100.0, 0.0, 0.0], True),
+        ("x*x + y*y > 1", [1001.0, 0.0, 0.0, 0.0], True),  # in m², as products are
+        ("a*a > 30deg*30deg", [0.0, 0.0, 1.0, 0.0], False),  # deg
+        ("a*a > 30deg*30deg", [0.0, 0.0, 31.0, 0.0], True),
+        ("a > 30", [0.0, 0.0, 31.0, 0.0], True),  # a plain number is in the column's own unit
+        ("a > 30", [0.0, 0.0, 29.0, 0.0], False),
+        ("abs(2 * a) > 60 - 1", [0.0, 0.0, -29.6, 0.0], True),
+        ("a > 0.5rad", [0.0, 0.0, 29.0, 0.0], True),
+        ("a > b", [0.0, 0.0, 60.0, 1.0], True),  # deg against rad: 1.05 > 1
+        ("a > b", [0.0, 0.0, 57.0, 1.0], False),
+        ("a + 0.5rad > 58", [0.0, 0.0, 30.0, 0.0], True),
+        ("min(x, 3mm) < 0.002m", [1.0, 0.0, 0.0, 0.0], True),
+        ("sin(a) > 0.5", [0.0, 0.0, 31.0, 0.0], True),
+        ("x / 2 > 500", [1001.0, 0.0, 0.0, 0.0], True),
+    ],
+)
+def test_units_are_the_same_in_products_and_in_any_column(text, row, expected):
+    columns = (Column("x", "mm"), Column("y", "mm"), Column("a", "deg"), Column("b", "rad"))
+    assert parse_predicate(text, columns)(np.array(row)) is expected
+    # The same in the units without prefixes.
+    si = (Column("x", "m"), Column("y", "m"), Column("a", "rad"), Column("b", "rad"))
+    factors = np.array([1e-3, 1e-3, math.pi / 180, 1.0])
+    if not re.search(r"(a > 30|> 58|> 60|> 500)", text):  # plain numbers are in other units there
+        assert parse_predicate(text, si)(np.array(row) * factors) is expected
+
+
+def test_what_the_environment_says_of_a_step_is_a_condition():
+    system = make_system("cartpole", fall_angle_deg=10.0)
+    fails = Judged(system, failure="terminated or x > 100")
+    trajectory = rollout(fails, Idle(), seed=0, demonstrator="test")
+    assert trajectory.outcome is Outcome.FAILURE
+    assert trajectory.failure_step == trajectory.n_steps
+    ends = Judged(make_system("cartpole", duration=0.1), success="truncated and not terminated")
+    assert rollout(ends, Idle(), seed=0, demonstrator="test").outcome is Outcome.SUCCESS
+    with pytest.raises(MisstepError, match="no column 'terminated'"):
+        parse_predicate("terminated", system.observation_columns)
+
+
+@pytest.mark.parametrize("x", [0.0, 2.0])
+@pytest.mark.parametrize("over", [False, True])
+def test_conditions_on_flags_can_be_joined_with_others(x, over):
+    columns = make_system("cartpole").observation_columns
+    ended = parse_predicate("terminated", columns, flags=FLAGS)
+    row = np.concatenate([[x], np.zeros(len(columns) - 1), [over, False]])
+    width = len(columns)
+
+    def far(observation):
+        assert len(observation) == width
+        return observation[0] > 1
+
+    for formula, expected in [
+        (ended & far, over and x > 1),
+        (ended | far, over or x > 1),
+        (~ended & far, not over and x > 1),
+        (parse_predicate("x > 1", columns) | ended, over or x > 1),
+        (ended & ended, over),
+    ]:
+        assert formula.reads_flags
+        assert formula(row) is expected
+
+
+@pytest.mark.parametrize("seconds", [0.2, 0.98, 1.0, 1.5])
+def test_a_recording_is_judged_as_it_would_be_live(seconds):
+    # Success all along, and hold longer than some of them last.
+    judge = {"success": "abs(x) < 1", "hold": 1.0}
+    driven = make_system("cartpole", duration=seconds, fall_angle_deg=180.0, **judge)
+    live = rollout(driven, Idle(), seed=0, demonstrator="test")
+    plain = rollout(driven.unwrapped, Idle(), seed=0, demonstrator="test")
+    recorded = judged(Episode.of(plain), failure=None, **judge)
+    list(recorded.blocks)
+    assert recorded.ending().outcome == live.outcome
+    assert (live.outcome is Outcome.SUCCESS) == (seconds >= 1.0)

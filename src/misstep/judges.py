@@ -6,9 +6,13 @@ A formula is parsed into nested functions and never evaluated as Python. It know
 ``+ - * /``, comparisons that may be chained, ``and or not``, parentheses and the functions abs,
 min, max, sin, cos, sqrt; precedence is Python's.
 
-A number may carry a unit, ``30deg`` or ``5 cm``. Where it meets a column it is converted to the
-column's own unit; units that do not fit are refused. A plain number is in the column's unit. In a
-product, or with no column to meet, a number is converted to m, rad, s, N or kg.
+A number may carry a unit, ``30deg`` or ``5 cm``. Everything is reckoned in m, rad, s, N and kg:
+columns in other units are brought to these where they are read, and units that do not fit are
+refused. A plain number beside a column is in the column's own unit, whatever that is; beside a
+product of columns it is in the units without prefixes.
+
+Where an environment is judged step by step, ``terminated`` and ``truncated`` are conditions too:
+what it said of its last step.
 """
 
 import math
@@ -34,6 +38,9 @@ LONGEST = 500
 DEEPEST = 40
 """Parentheses, functions and signs inside each other."""
 
+FLAGS = ("terminated", "truncated")
+"""What can be asked of a step of an environment, beside what it observes."""
+
 PYTHON = "python:"
 """Starts the text of what was judged by a Python function, which no text can bring back."""
 
@@ -50,10 +57,13 @@ class Formula:
         The formula; of a Python function ``"python:"`` and its name.
     function : callable
         From an observation (n,) to a truth or a number.
+    reads_flags : bool
+        Whether the function also wants the `FLAGS`, after the observation's columns.
     """
 
     text: str
     function: Callable[[Observation], Any]
+    reads_flags: bool = False
 
     def __call__(self, observation: Observation, /) -> Any:
         """Return the value for an observation, shape (n,): a truth or a number."""
@@ -61,19 +71,28 @@ class Formula:
 
     def __and__(self, other: "Formula | Callable[[Observation], Any]") -> "Formula":
         second = _formula(other)
-        return Formula(_joined(self, "and", second), lambda o: bool(self(o)) and bool(second(o)))
+        first, second, flags = _of_one_row(self, second)
+        text = _joined(self, "and", second)
+        return Formula(text, lambda o: bool(first(o)) and bool(second(o)), flags)
 
     def __or__(self, other: "Formula | Callable[[Observation], Any]") -> "Formula":
         second = _formula(other)
-        return Formula(_joined(self, "or", second), lambda o: bool(self(o)) or bool(second(o)))
+        first, second, flags = _of_one_row(self, second)
+        text = _joined(self, "or", second)
+        return Formula(text, lambda o: bool(first(o)) or bool(second(o)), flags)
 
     def __invert__(self) -> "Formula":
         inner = self.text.removeprefix(PYTHON)
         origin = PYTHON if self.text.startswith(PYTHON) else ""
-        return Formula(f"{origin}not ({inner})", lambda o: not self(o))
+        return Formula(f"{origin}not ({inner})", lambda o: not self(o), self.reads_flags)
 
 
-def parse_predicate(text: Judge, columns: Sequence[Column], what: str = "the predicate") -> Formula:
+def parse_predicate(
+    text: Judge,
+    columns: Sequence[Column],
+    what: str = "the predicate",
+    flags: Sequence[str] = (),
+) -> Formula:
     """Read a condition on the columns of an observation.
 
     Parameters
@@ -84,6 +103,8 @@ def parse_predicate(text: Judge, columns: Sequence[Column], what: str = "the pre
         Those of the observation, in its order.
     what : str
         What the condition is for, for messages.
+    flags : sequence of str
+        Conditions that may be named too: `FLAGS`, where a row holds them after its columns.
 
     Returns
     -------
@@ -97,20 +118,26 @@ def parse_predicate(text: Judge, columns: Sequence[Column], what: str = "the pre
         If it is no condition, names an unknown column, mixes units that do not fit, or is longer
         than 500 characters or deeper than 40 levels; the message marks where.
     """
-    return _parse(text, columns, what, "truth")
+    return _parse(text, columns, what, "truth", flags)
 
 
-def parse_cost(text: Judge, columns: Sequence[Column], what: str = "the cost") -> Formula:
+def parse_cost(
+    text: Judge, columns: Sequence[Column], what: str = "the cost", flags: Sequence[str] = ()
+) -> Formula:
     """Read a number from the columns of an observation, such as ``"abs(theta) * 57.3"``.
 
     Parameters, result and errors are those of `parse_predicate`, but for the result's value: a
     number, infinite or NaN after a division by zero.
     """
-    return _parse(text, columns, what, "number")
+    return _parse(text, columns, what, "number", flags)
 
 
 def _parse(
-    text: Judge, columns: Sequence[Column], what: str, kind: Literal["truth", "number"]
+    text: Judge,
+    columns: Sequence[Column],
+    what: str,
+    kind: Literal["truth", "number"],
+    flags: Sequence[str],
 ) -> Formula:
     if not isinstance(text, str):
         return _formula(text, what)
@@ -119,8 +146,23 @@ def _parse(
             f"{what} was the Python function {text.removeprefix(PYTHON)!r}, which a file cannot "
             "hold: give that function, or a formula"
         )
-    node = _Parser(text, columns, what).formula(kind)
-    return Formula(" ".join(text.split()), lambda observation: node.value(observation.tolist()))
+    parser = _Parser(text, columns, what, flags)
+    node = parser.formula(kind)
+    words = " ".join(text.split())
+    return Formula(words, lambda row: node.value(row.tolist()), parser.reads_flags)
+
+
+def _of_one_row(first: Formula, second: Formula) -> tuple[Formula, Formula, bool]:
+    """Return both with the flags in their row if one of them reads these, and whether it does."""
+    if first.reads_flags == second.reads_flags:
+        return first, second, first.reads_flags
+    if first.reads_flags:
+        return first, _without_flags(second), True
+    return _without_flags(first), second, True
+
+
+def _without_flags(formula: Formula) -> Formula:
+    return Formula(formula.text, lambda o: formula(o[: -len(FLAGS)]), True)
 
 
 def _formula(judge: object, what: str = "the predicate") -> Formula:
@@ -166,7 +208,8 @@ class _Node:
     start: int
     truth: bool = False
     constant: bool = False
-    unit: str | None = None  # None: a plain number, fits every unit; "": a column without a unit
+    unit: str | None = None  # without prefixes; None: a plain number, fits every unit; "": none
+    scale: float = 1.0  # of the unit that a plain number beside it is in
 
 
 def _quotient(a: float, b: float) -> float:
@@ -223,9 +266,13 @@ class _Parser:
                  | "(" or ")"
     """
 
-    def __init__(self, text: str, columns: Sequence[Column], what: str) -> None:
+    def __init__(
+        self, text: str, columns: Sequence[Column], what: str, flags: Sequence[str]
+    ) -> None:
         self._text, self._what = text, what
         self._columns = {column.name: (i, column.unit) for i, column in enumerate(columns)}
+        self._flags = {name: len(columns) + i for i, name in enumerate(flags)}
+        self.reads_flags = False
         if len(text) > LONGEST:
             raise MisstepError(
                 f"{what} has {len(text)} characters; at most {LONGEST} are read as a formula"
@@ -350,7 +397,7 @@ class _Parser:
                 result += sign * value(row)
             return result
 
-        return _Node(total, node.start, constant=_constant(nodes), unit=_common_unit(nodes))
+        return _Node(total, node.start, False, _constant(nodes), *_common_unit(nodes))
 
     def _product(self) -> _Node:
         node = self._factor()
@@ -363,9 +410,8 @@ class _Parser:
         nodes = [self._number(n) for n in nodes]
         united = [i for i, n in enumerate(nodes) if n.unit]
         # Twice an angle is an angle; of other products nothing is said.
-        unit = nodes[united[0]].unit if len(united) == 1 and not divides[united[0]] else None
-        if unit is None:
-            nodes = [_converted(n, _base(n.unit)) if n.constant else n for n in nodes]
+        alone = nodes[united[0]] if len(united) == 1 and not divides[united[0]] else None
+        unit, scale = (None, 1.0) if alone is None else (alone.unit, alone.scale)
         factors = [(n.value, divide) for n, divide in zip(nodes, divides, strict=True)]
 
         def product(row: Row) -> float:
@@ -375,7 +421,7 @@ class _Parser:
                 result = _quotient(result, other) if divide else result * other
             return result
 
-        return _Node(product, node.start, constant=_constant(nodes), unit=unit)
+        return _Node(product, node.start, False, _constant(nodes), unit, scale)
 
     def _factor(self) -> _Node:
         token = self._next
@@ -389,8 +435,9 @@ class _Parser:
             return node
         if token.kind == "number":
             self._at += 1
-            number = float(token.text)
-            return _Node(lambda row: number, token.start, constant=True, unit=token.unit)
+            base, factor = (None, 1.0) if token.unit is None else _base(token.unit)
+            number = factor * float(token.text)
+            return _Node(lambda row: number, token.start, constant=True, unit=base)
         if token.kind == "name" and token.text not in _KEYWORDS:
             self._at += 1
             is_call = self._next.text == "(" and token.text not in self._columns
@@ -415,32 +462,36 @@ class _Parser:
             return _Node(
                 lambda row: choose([value(row) for value in values]),
                 token.start,
-                constant=_constant(nodes),
-                unit=_common_unit(nodes),
+                False,
+                _constant(nodes),
+                *_common_unit(nodes),
             )
         if len(nodes) != 1:
             self._fail(token.start, f"{token.text} takes one value, not {len(nodes)}")
         return self._function_of_one(token, self._number(nodes[0]))
 
     def _function_of_one(self, token: _Token, node: _Node) -> _Node:
-        unit = node.unit if token.text == "abs" else None
-        if token.text in ("sin", "cos"):
-            if node.unit and _base(node.unit) != "rad":
-                self._fail(node.start, f"{token.text} takes an angle, but this is in {node.unit}")
-            node = _converted(node, _base(node.unit))
-        elif token.text == "sqrt" and node.constant:
-            node = _converted(node, _base(node.unit))
+        unit, scale = (node.unit, node.scale) if token.text == "abs" else (None, 1.0)
+        if token.text in ("sin", "cos") and node.unit and node.unit != "rad":
+            self._fail(node.start, f"{token.text} takes an angle, but this is in {node.unit}")
         function, value = _ONE_ARGUMENT[token.text], node.value
         return _Node(
-            lambda row: function(value(row)), token.start, constant=node.constant, unit=unit
+            lambda row: function(value(row)), token.start, False, node.constant, unit, scale
         )
 
     def _column(self, token: _Token) -> _Node:
+        if token.text not in self._columns and token.text in self._flags:
+            self.reads_flags = True
+            flag = self._flags[token.text]
+            return _Node(lambda row: bool(row[flag]), token.start, truth=True)
         if token.text not in self._columns:
             listed = ", ".join(n + (f" [{u}]" if u else "") for n, (_, u) in self._columns.items())
             self._fail(token.start, f"no column {token.text!r}; there are: {listed}")
         index, unit = self._columns[token.text]
-        return _Node(operator.itemgetter(index), token.start, unit=unit)
+        base, factor = _base(unit)
+        if factor == 1.0:
+            return _Node(operator.itemgetter(index), token.start, unit=base)
+        return _Node(lambda row: factor * row[index], token.start, unit=base, scale=factor)
 
     # What may stand where
 
@@ -471,20 +522,19 @@ class _Parser:
         return node
 
     def _aligned(self, nodes: list[_Node]) -> list[_Node]:
-        """Return the nodes in one unit: that of the first column, else that all are based on."""
+        """Return the nodes with plain numbers in the unit of the first column beside them."""
         united = [self._number(n) for n in nodes if n.unit is not None or n.truth]
-        columns = [n for n in united if not n.constant]
-        first = next(iter(columns or united), None)
+        first = next((n for n in united if not n.constant), None) or next(iter(united), None)
         if first is None:
             return nodes
-        target = first.unit if columns else _base(first.unit)
         for node in united:
-            if _base(node.unit) != _base(target):
+            if node.unit != first.unit:
                 self._fail(
                     node.start,
-                    f"this is {_in(node.unit)} and cannot be set against what is {_in(target)}",
+                    f"this is {_in(node.unit)} and cannot be set against what is {_in(first.unit)}",
                 )
-        return [_converted(n, target) for n in nodes]
+        scale = first.scale
+        return [_scaled(n, scale) if n.unit is None and n.constant else n for n in nodes]
 
 
 def _quoted(token: _Token) -> str:
@@ -499,18 +549,17 @@ def _constant(nodes: Sequence[_Node]) -> bool:
     return all(node.constant for node in nodes)
 
 
-def _common_unit(aligned: Sequence[_Node]) -> str | None:
-    return next((node.unit for node in aligned if node.unit is not None), None)
+def _common_unit(aligned: Sequence[_Node]) -> tuple[str | None, float]:
+    """Return the unit of the first node that has one, and its scale."""
+    first = next((node for node in aligned if node.unit is not None), None)
+    return (None, 1.0) if first is None else (first.unit, first.scale)
 
 
-def _base(unit: str | None) -> str | None:
-    """Return the unit that `unit` is converted to; itself if it is not known."""
-    return unit if unit is None or unit not in UNITS else UNITS[unit][0]
+def _base(unit: str) -> tuple[str, float]:
+    """Return the unit without a prefix, and how many of those it is; itself if it is not known."""
+    return UNITS.get(unit, (unit, 1.0))
 
 
-def _converted(node: _Node, unit: str | None) -> _Node:
-    """Return the node in another unit of the same base."""
-    if node.unit is None or unit is None or node.unit == unit:
-        return node
-    factor, value = UNITS[node.unit][1] / UNITS[unit][1], node.value
-    return replace(node, value=lambda row: factor * value(row), unit=unit)
+def _scaled(node: _Node, factor: float) -> _Node:
+    value = node.value
+    return node if factor == 1.0 else replace(node, value=lambda row: factor * value(row))

@@ -91,7 +91,7 @@ class _Judge:
         elif self._success is None:
             return recorded
         else:
-            succeeded = self._held >= min(self._needed, self._rows)
+            succeeded = self._held >= self._needed
             outcome = Outcome.SUCCESS if succeeded else Outcome.FAILURE
             step = None if succeeded else self._rows - 1
             formula = self._success.text if succeeded else f"not ({self._success.text})"

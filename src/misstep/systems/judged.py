@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from misstep.errors import MisstepError
-from misstep.judges import Formula, Judge, parse_cost, parse_predicate
+from misstep.judges import FLAGS, Formula, Judge, parse_cost, parse_predicate
 from misstep.parameters import ParameterRow, ParameterValue
 from misstep.systems.mechanics import Mechanics
 from misstep.systems.simulated import LONGEST_TIME
@@ -84,6 +84,7 @@ class Judged(System):
         self._success = _read(parse_predicate, success, columns, f"{name}, success")
         self._failure = _read(parse_predicate, failure, columns, f"{name}, failure")
         self._cost = _read(parse_cost, cost, columns, f"{name}, cost")
+        self._flags = False, False
         self._needed = _steps_to_hold(name, hold, self._success, system.dt)
 
         self._take_after(system)
@@ -116,7 +117,7 @@ class Judged(System):
         """Start an episode; the arguments are the system's."""
         super().reset(seed=seed)
         observation, info = self.system.reset(seed=seed, options=options)
-        self._over = False
+        self._over, self._flags = False, (False, False)
         self._held = 0
         self._failed = bool(info.get("failed", False)) or self._fails(observation)
         self._watch(observation)
@@ -135,6 +136,7 @@ class Judged(System):
         if self._over:
             raise self.no_episode()
         observation, reward, terminated, truncated, info = self.system.step(action)
+        self._flags = bool(terminated), bool(truncated)
         self._watch(observation)
         fails = self._fails(observation)
         # That its own time is over without its own success is not for the system to say.
@@ -158,10 +160,15 @@ class Judged(System):
     def _watch(self, observation: NDArray[np.float64]) -> None:
         """Count at how many observations in a row the success has held."""
         if self._success is not None:
-            self._held = self._held + 1 if self._success(observation) else 0
+            self._held = self._held + 1 if self._says(self._success, observation) else 0
 
     def _fails(self, observation: NDArray[np.float64]) -> bool:
-        return self._failure is not None and bool(self._failure(observation))
+        return self._failure is not None and bool(self._says(self._failure, observation))
+
+    def _says(self, formula: Formula, observation: NDArray[np.float64]) -> Any:
+        if formula.reads_flags:
+            return formula(np.append(observation, self._flags))
+        return formula(observation)
 
     def _succeeds(self, info: dict[str, Any]) -> bool:
         if self._success is None:
@@ -169,7 +176,7 @@ class Judged(System):
         return self._held >= self._needed
 
     def _cost_of(self, cost: Formula, observation: NDArray[np.float64]) -> float:
-        value = float(cost(observation))
+        value = float(self._says(cost, observation))
         if not math.isfinite(value):
             seen = ", ".join(
                 f"{column.name} = {number:g}"
@@ -196,7 +203,7 @@ class Judged(System):
 def _read(
     parse: Callable[..., Formula], judge: Judge | None, columns: Any, what: str
 ) -> Formula | None:
-    return None if judge is None else parse(judge, columns, what)
+    return None if judge is None else parse(judge, columns, what, FLAGS)
 
 
 def _steps_to_hold(name: str, hold: float, success: Formula | None, dt: float) -> int:
