@@ -584,6 +584,18 @@ def test_a_robot_that_fails_on_its_way_is_watched_in_the_next_episode_too():
     assert system.actions[-2:] == [9.0, 0.0]
 
 
+def test_the_next_client_drives_as_soon_as_the_one_before_is_gone(offered):
+    first = RemoteSystem(address=offered)
+    with pytest.raises(MisstepError, match="another client drives"):
+        RemoteSystem(address=offered)
+    leaving = threading.Timer(0.2, first.close)
+    leaving.start()
+    second = RemoteSystem(address=offered)  # comes while the first is still there
+    leaving.join()
+    second.reset(seed=1)
+    second.close()
+
+
 def test_there_is_an_end_to_the_clients_of_a_robot(short, tmp_path):
     hub = SystemHub(short, SECRET)
     server = SocketServer(hub, f"unix:{tmp_path}/robot")

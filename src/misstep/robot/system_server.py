@@ -33,6 +33,7 @@ from misstep.systems import System
 _LOG = logging.getLogger(__name__)
 _NEAR = 1e-9  # of the action's unit
 _MOST_STEPS_TO_SAFE = 10_000
+_PARTING = 1.0  # s, in which a client that has just gone is noticed, also by a busy machine
 
 
 class SystemHub:
@@ -74,6 +75,7 @@ class SystemHub:
         self._door = threading.Lock()
         self._sessions: set[_SystemSession] = set()
         self._driver: _SystemSession | None = None
+        self._wheel_is_free = threading.Condition(self._lock)
         self._in_episode = False
         self._stepped_at: float | None = None
         self._closing = threading.Event()
@@ -96,6 +98,7 @@ class SystemHub:
         with self._lock:
             if self._driver is session:
                 self._driver = None
+                self._wheel_is_free.notify()
                 self._retreat("the other side is gone")
 
     def close(self) -> None:
@@ -109,7 +112,7 @@ class SystemHub:
         """Let a client drive and return the description of the system, or raise MisstepError."""
         read_hello(message, self._token, "robot")
         with self._lock:
-            if self._driver is not None:
+            if not self._wheel_is_free.wait_for(lambda: self._driver is None, _PARTING):
                 raise MisstepError("another client drives")
             self._driver = session
         return {"system": self._system.system_id, **describe_system(self._system)}
